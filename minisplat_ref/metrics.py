@@ -4,6 +4,9 @@ Renderings are clipped to [0, 1] but not rounded to 8 bits, which would add 1.3e
 at 30 dB. PSNR is computed from the mean squared error over all pixels and channels of an image; the released 3DGS
 script averages the PSNR of the channels instead, which is never lower. Means over views are means of the views' values.
 
+Nothing says what exposure and white balance a held-out photograph had. So its PSNR is given twice: as rendered, and
+after the affine map of the colours that brings the rendering closest to the photograph (:func:`correct_colors`).
+
 LPIPS needs the weights of a network, which are not ours to ship; without them an :class:`Evaluation` says so.
 """
 
@@ -35,6 +38,8 @@ class ViewMetrics(NamedTuple):
     ssim: float
     lpips: float | None = None
     """None when it was not measured."""
+    psnr_corrected: float | None = None
+    """dB, after :func:`correct_colors`."""
 
 
 class Evaluation(NamedTuple):
@@ -51,6 +56,8 @@ class Evaluation(NamedTuple):
     per_view: list[ViewMetrics]
     lpips_network: str | None = None
     """VGG16 or AlexNet, whose distances cannot be compared with each other; None when LPIPS was not measured."""
+    psnr_corrected: float | None = None
+    """dB after :func:`correct_colors`, mean of the views; None without views."""
 
 
 def psnr(image: Floats, target: Floats | Ints, mask: Bools | None = None) -> float:
@@ -98,6 +105,34 @@ def ssim(image: Floats, target: Floats | Ints, mask: Bools | None = None, *, bac
     return 1.0 - float(loss)
 
 
+def correct_colors(image: Floats, target: Floats | Ints, mask: Bools | None = None) -> Floats:
+    """Return the image after the affine map of its colours that minimises the squared error.
+
+    ::
+
+        c' = A c + b   with A [3, 3] and b [3] minimising sum |A c + b - target|^2, then clipped to [0, 1]
+
+    Where a colour does not vary, or varies with another, of the best maps that of least norm is taken.
+
+    Parameters
+    ----------
+    image, target : ndarray of shape (H, W, 3)
+        In [0, 1]; the target may also be bytes, of which 255 is 1.
+    mask : ndarray of shape (H, W) of booleans, optional
+        Pixels that count; default all. The map is applied to all pixels.
+
+    Returns
+    -------
+    ndarray of shape (H, W, 3), float32
+    """
+    counted: Any = slice(None) if mask is None else mask.ravel()
+    ones = np.ones((image.shape[0] * image.shape[1], 1))
+    colors = np.hstack([image.reshape(-1, 3).astype(np.float64), ones])  # [H * W, 4]
+    wanted = target.reshape(-1, 3)[counted].astype(np.float64) / (255.0 if target.dtype == np.uint8 else 1.0)
+    E = np.linalg.lstsq(colors[counted], wanted, rcond=None)[0]  # [4, 3], [A | b] transposed
+    return np.clip(colors @ E, 0.0, 1.0).astype(np.float32).reshape(image.shape)
+
+
 def evaluate(
     model: Any,
     views: Sequence[View],
@@ -135,12 +170,14 @@ def evaluate(
             psnr(image, view.image, view.mask),
             ssim(image, view.image, view.mask, backend=settings.backend),
             None if network is None else lpips(image, view.image, network, view.mask),
+            psnr(correct_colors(image, view.image, view.mask), view.image, view.mask),
         )
         per_view.append(metrics)
         if on_view is not None:
             on_view(view, image, metrics)
     if not per_view:
         return Evaluation(None, None, None, NO_VIEWS, per_view)
+    corrected = [view.psnr_corrected for view in per_view if view.psnr_corrected is not None]
     distances = [view.lpips for view in per_view if view.lpips is not None]
     return Evaluation(
         float(np.mean([view.psnr for view in per_view])),
@@ -149,4 +186,5 @@ def evaluate(
         None if distances else NO_WEIGHTS,
         per_view,
         None if network is None else network.backbone.name,
+        float(np.mean(corrected)),
     )

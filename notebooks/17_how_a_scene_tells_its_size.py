@@ -117,6 +117,8 @@ for name, log in logs.items():
 # | `minisplat_ref/methods/adaptive/numbers.py` | all its numbers, each with its reason |
 # | `minisplat_ref/methods/adaptive/growth.py`, `progress.py` | what is halved; what is measured, and when it ends |
 # | `minisplat_ref/strategy/halving.py` | one Gaussian becomes two halves |
+# | `minisplat_ref/training/dense_start.py`, `strategy/plane_sweep.py` | points that stereo adds to the sparse ones |
+# | `minisplat_ref/methods/adaptive/veils.py`, `strategy/line_of_sight.py` | what stands before points that are seen |
 # | `minisplat_ref/methods/adaptive/prune.py` | what is pruned, in slices |
 # | `minisplat_ref/methods/adaptive/degrees.py` | how many degrees of the harmonics each Gaussian has |
 # | `minisplat_ref/training/pace.py` | what was measured and decided; which views are held back |

@@ -7,7 +7,7 @@ import pytest
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.errors import InputError
-from minisplat_ref.metrics import evaluate, psnr, ssim
+from minisplat_ref.metrics import correct_colors, evaluate, psnr, ssim
 from minisplat_ref.reference.loss import ssim_map
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.types import View
@@ -64,6 +64,26 @@ def test_ssim_has_the_published_window(backend):
     assert ssim(image, np.zeros_like(image), backend=backend) == pytest.approx(expected.mean(), rel=PARITY_FLOAT64)
 
 
+def test_colours_corrected_by_hand(rng):
+    """A photograph that is an affine map of the rendering: nothing is left, where it does not leave [0, 1]."""
+    image = rng.uniform(0.2, 0.6, (9, 11, 3)).astype(np.float32)
+    A = np.array([[0.9, 0.1, 0.0], [0.0, 1.2, -0.1], [0.05, 0.0, 0.8]])
+    target = image @ A.T + [0.02, -0.03, 0.1]
+    np.testing.assert_allclose(correct_colors(image, target), target, atol=1e-6)
+    assert psnr(correct_colors(image, target), target) > 100 > 30 > psnr(image, target)
+    mask = np.zeros((9, 11), bool)
+    mask[:5] = True
+    target[5:] = 1 - target[5:]  # what is masked has no say
+    np.testing.assert_allclose(correct_colors(image, target, mask)[:5], target[:5], atol=1e-6)
+    bytes_ = np.round(255 * target).astype(np.uint8)
+    np.testing.assert_allclose(correct_colors(image, bytes_, mask)[:5], target[:5], atol=0.6 / 255)
+    grey = np.full((9, 11, 3), 0.5, np.float32)  # a map of rank one
+    np.testing.assert_allclose(
+        correct_colors(grey, target, mask)[:5], target[:5].mean(axis=(0, 1)) + 0 * grey[:5], atol=1e-6
+    )
+    assert correct_colors(grey, np.full_like(grey, 3.0)).max() == 1  # clipped, as renderings are
+
+
 def test_evaluation(rng, backend):
     gaussians = as_dtype(make_gaussians(rng, 30), np.float32)
     background = np.array([0.2, 0.4, 0.6])
@@ -84,6 +104,9 @@ def test_evaluation(rng, backend):
     assert result.psnr == pytest.approx(np.mean(values))
     assert result.ssim == pytest.approx(np.mean([view.ssim for view in result.per_view]))
     assert result.per_view[0].ssim > result.per_view[1].ssim > result.per_view[2].ssim
+    corrected = [view.psnr_corrected for view in result.per_view]
+    assert result.psnr_corrected == pytest.approx(np.mean(corrected))
+    assert all(after > before for after, before in zip(corrected, values, strict=True)) and corrected[1] > 35
     assert result.lpips is None and "weights" in result.lpips_reason
     assert [view.name for view, _, _ in seen] == ["view0", "view1", "view2"]
     assert seen[0][1].shape == (18, 24, 3) and seen[0][1].max() <= 1.0

@@ -207,7 +207,7 @@ def _start(given: dict[str, Any]) -> int:
     room = _check_room(scene, state, settings)
     compile_kernels(settings.backend)
     run_folder.create(folder)
-    warn_of_scene(scene, settings.downscale)
+    warn_of_scene(scene, settings.downscale, is_dense=recipe.starts_densely)
     report_inventory(Path(settings.scene), scene, settings.model)
     proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
     if proposal is not None:
@@ -272,6 +272,7 @@ def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "Tra
         print(f"minisplat-ref: {notice}", file=sys.stderr)
     if settings.init is not None:
         print(f"starts from {len(start.points):,} points of {settings.init}")
+        recipe = recipe._replace(starts_densely=False)  # from these points, as asked
     return initial_state(start, recipe, settings.seed)
 
 

@@ -4,39 +4,14 @@ Loading a scene with ``downscale=D`` uses that folder, and resizes on the fly wi
 are rounded; colours pass through the same LANCZOS filter as on the fly.
 """
 
-import warnings
 from pathlib import Path
 
 from tqdm import tqdm
 
-from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.datasets.photo_files import list_images
+from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.io.images import IMAGE_SUFFIXES, downscaled_size, read_image, resize_image, write_image
-
-UNREAD_SUFFIXES = (
-    *(".heic", ".heif", ".avif", ".jxl"),
-    *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
-)
-"""Formats of phones and cameras that Pillow does not decode."""
-NAMED_MAX = 20  # files that a message names
-
-
-def list_images(folder: Path) -> list[Path]:
-    """Return the image files in a folder and below, sorted by name; warn of photographs in unsupported formats."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give a folder with photographs")
-    found = sorted(file for file in folder.rglob("*") if file.is_file())
-    files = [file for file in found if file.suffix.lower() in IMAGE_SUFFIXES]
-    others = [file for file in found if file.suffix.lower() in UNREAD_SUFFIXES]
-    names = ", ".join(str(file.relative_to(folder)) for file in others[:NAMED_MAX])
-    names += f" and {len(others) - NAMED_MAX} more" if len(others) > NAMED_MAX else ""
-    not_read = f"{len(others)} photographs of formats that are not read ({names}): convert them to JPEG"
-    if not files:
-        found_instead = f", but {not_read}" if others else ""
-        raise InputError(f"{folder}: no images in it (looked for {' '.join(IMAGE_SUFFIXES)}){found_instead}")
-    if others:
-        warnings.warn(one_line(f"{folder}: leaving out {not_read}"), InputWarning, stacklevel=2)
-    return files
+from minisplat_ref.io.images import downscaled_size, read_image, resize_image, write_image
 
 
 def downscale_images(images: Path, factor: int) -> Path:

@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.io.colmap import colmap_photos, find_model, read_model
-from minisplat_ref.io.images import SAVE_OPTIONS, write_image
+from minisplat_ref.io.colmap import colmap_photos, find_model, read_model, write_model
+from minisplat_ref.io.images import SAVE_OPTIONS, open_image, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
@@ -56,32 +56,66 @@ def undistort_scene(scene: Path, out: Path) -> None:
         raise InputError(f"{scene}: neither a COLMAP model nor a transforms.json; give the folder of a scene")
     with making_folder(out) as folder:
         if model is not None:
-            _undistort_colmap(scene, model, folder)
+            photos = colmap_photos(scene, read_model(scene))
+            _check_distorted(scene, photos)
+            undistort_colmap(scene, photos, folder)
         else:
             _undistort_transforms(files, folder)
 
 
-def undistort_model(model: Path, images: Path, out: Path) -> None:
-    """Undistort a COLMAP model and its images into ``out/images`` and ``out/sparse/0``; ``out`` must exist."""
+def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Photo]:
+    """Undistort a COLMAP scene into ``out/images``, ``out/sparse/0`` and ``out/masks``, if it has masks.
+
+    Parameters
+    ----------
+    scene : Path
+        Folder with ``images/`` and a model.
+    photos : sequence of Photo
+        Those of the model that have a camera.
+    out : Path
+        Folder, which must exist.
+
+    Returns
+    -------
+    list of Photo
+        The undistorted ones, as the loader finds them.
+
+    Raises
+    ------
+    InputError
+        If a photograph or a mask cannot be read, or COLMAP has left one out.
+    """
     pycolmap = import_quiet_pycolmap()
     with tempfile.TemporaryDirectory(dir=out) as temporary:
         quality = SAVE_OPTIONS["JPEG"]["quality"]
-        pycolmap.undistort_images(temporary, str(model), str(images), jpeg_quality=quality)
+        model = Path(temporary, "model")
+        model.mkdir()
+        write_model(scene, model)
+        pycolmap.undistort_images(temporary, str(model), str(scene / "images"), jpeg_quality=quality)
         (out / "sparse").mkdir()
         shutil.move(Path(temporary, "images"), out / "images")
         shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")
-
-
-def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
-    """Undistort model and images with COLMAP, and masks as the loader does, which gives the same camera."""
-    photos = colmap_photos(scene, read_model(scene))
-    _check_distorted(scene, photos)
-    undistort_model(model, scene / "images", folder)
     reading = build_reading(1, None, undistort=True, alpha_is_mask=True)
     for photo in tqdm(photos, desc="masks", unit=" images", leave=False, disable=None):
-        mask = read_view(photo, photo.file, reading).mask
-        if mask is not None:
-            _write(folder / "masks" / f"{photo.file}.png", mask)
+        # COLMAP does not write every format that the loader reads (not WebP), and does not say so.
+        is_missing = not (out / "images" / photo.file).is_file()
+        if is_missing or _has_mask(photo):
+            view = read_view(photo, photo.file, reading)
+            if is_missing:
+                _write(out / "images" / photo.file, view.image)
+            if view.mask is not None:
+                _write(out / "masks" / f"{photo.file}.png", view.mask)
+    written = colmap_photos(out, read_model(out))
+    missing = sorted({photo.file for photo in photos} - {photo.file for photo in written})
+    if missing:
+        raise InputError(f"{scene}: COLMAP has not undistorted {', '.join(missing)}; export the model again")
+    return written
+
+
+def _has_mask(photo: Photo) -> bool:
+    """Return whether a photograph has a mask or transparency, without reading its pixels."""
+    with open_image(photo.path) as image:
+        return photo.mask_path is not None or image.has_transparency_data
 
 
 def _undistort_transforms(files: Sequence[Path], folder: Path) -> None:

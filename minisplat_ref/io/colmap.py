@@ -6,6 +6,7 @@ Poses follow COLMAP's convention, which is also ours: cam_from_world, OpenCV axe
 and images that COLMAP could not register.
 """
 
+import re
 import struct
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.colmap_text import readable, text_names
+from minisplat_ref.io.colmap_text import read_text, readable, text_names
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
 from minisplat_ref.io.names import name_inside, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, PointCloud, load_points
@@ -25,6 +26,7 @@ from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
 POINTS_PLY = "points3D.ply"  # which 3DGS and its viewers write beside the model's points
+N_IMAGES = re.compile(r"# Number of images: (\d+)")  # in a model as text
 
 
 class Records(NamedTuple):
@@ -154,6 +156,8 @@ def read_model(path: Path, name: str | None = None) -> Any:
         for name, layout in BINARY_RECORDS.items():
             if (model / name).is_file():
                 _check_records(model / name, layout)
+    elif (model / "images.txt").is_file():
+        _check_text_images(model / "images.txt")
     pycolmap = import_pycolmap()
     try:
         with readable(model) as folder:
@@ -171,6 +175,14 @@ def read_model(path: Path, name: str | None = None) -> Any:
             if reconstruction.exists_image(image_id) and " " in text:
                 reconstruction.image(image_id).name = text
     return reconstruction
+
+
+def write_model(path: Path, folder: Path) -> None:
+    """Write the model of a scene as pycolmap reads it, with the names that the photographs have on disk."""
+    reconstruction = read_model(path)
+    for image in reconstruction.images.values():
+        image.name = spelled_on_disk(path / "images", _name(path, image))
+    reconstruction.write_binary(str(folder))
 
 
 def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
@@ -265,6 +277,38 @@ def _points_beside(path: Path, model: Path | None) -> tuple[Floats, NDArray[np.u
         message = f"{path}: the model has no sparse points; give some to start from by --init PLY, or run sfm"
         warnings.warn(one_line(message), InputWarning, stacklevel=3)
     return cloud.points, cloud.colors
+
+
+def _check_text_images(file: Path) -> None:
+    """Refuse a text file of images in which second lines are missing; warn if its heading states more images.
+
+    An image takes two lines, the second of which lists its 2D features and is empty if there are none. Where a program
+    has left out empty lines, pycolmap takes every second image for the features of the one before.
+    """
+    lines = read_text(file).splitlines()
+    # Features are triples of numbers; an image has nine numbers and a name.
+    n_images = sum(len(line.split()) % 3 != 0 for line in lines if not line.startswith("#"))
+    n_read = 0
+    rest = iter(lines)
+    for line in rest:
+        if line.strip() and not line.startswith("#") and next(rest, None) is not None:
+            n_read += 1
+    if n_read < n_images:
+        raise InputError(
+            f"{file}: {n_images} images, of which {n_read} can be read: each needs a second line with its 2D features,"
+            " empty if it has none; add the empty lines, or export the model as binary"
+        )
+    headings = (N_IMAGES.match(line) for line in lines)
+    n_stated = next((int(heading[1]) for heading in headings if heading is not None), n_read)
+    if n_read < n_stated:
+        warnings.warn(
+            one_line(
+                f"{file}: {n_read} images, though its heading says {n_stated}; export the model again, unless images"
+                " were taken out on purpose"
+            ),
+            InputWarning,
+            stacklevel=4,
+        )
 
 
 def _check_records(file: Path, layout: Records) -> None:

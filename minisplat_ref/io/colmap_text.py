@@ -43,6 +43,12 @@ def _without_mark(file: Path) -> bytes | None:
     return None if encoding is None else file.read_bytes().decode(encoding, errors="replace").encode()
 
 
+def read_text(file: Path) -> str:
+    """Return the content of a text file; bytes that are no text become lone surrogates."""
+    content = _without_mark(file)
+    return (file.read_bytes() if content is None else content).decode("utf-8", errors="surrogateescape")
+
+
 def text_names(file: Path) -> dict[int, str]:
     """Return the names in a text file of images by their numbers: all that follows the ninth number of a line.
 
@@ -50,9 +56,7 @@ def text_names(file: Path) -> dict[int, str]:
     features, is passed over.
     """
     names = {}
-    content = _without_mark(file)
-    content = file.read_bytes() if content is None else content
-    lines = iter(content.decode("utf-8", errors="surrogateescape").splitlines())
+    lines = iter(read_text(file).splitlines())
     for line in lines:
         words = line.split(maxsplit=N_BEFORE_NAME)
         if not words or words[0].startswith("#"):

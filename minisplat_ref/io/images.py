@@ -10,6 +10,7 @@ dynamic range.
 
 import io
 import os
+import re
 import struct
 import threading
 import warnings
@@ -30,7 +31,10 @@ from minisplat_ref.types import Bools, Floats
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
-SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
+BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)
+"""Files and folders that are hidden, or that programs put beside photographs."""
+
+SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"quality": 95}}
 SOURCE = "minisplat_ref source"  # key of an opened image's path among its data, for messages on its values
 SIXTEEN_BIT_FORMATS = ("PNG", "PPM")  # whose 16-bit images some versions of Pillow keep in 32 bits
 HALF_LEVEL = 0.5 / 255.0  # by which a float may be outside 0 to 1: it rounds to black or white all the same
@@ -141,8 +145,8 @@ def white_of(image: Image.Image) -> float:
     if image.mode == "I":
         low, high = image.getextrema()
         raise InputError(
-            f"{image.info[SOURCE]}: integers of 32 bits, from {low} to {high}, do not say which value is white; export"
-            " the image with 8 or 16 bits a channel"
+            f"{_source(image)}: integers of 32 bits, from {low} to {high}, do not say which value is white; export the"
+            " image with 8 or 16 bits a channel"
         )
     return 255.0
 
@@ -175,14 +179,15 @@ def pixels_of(image: Image.Image) -> NDArray[np.uint8]:
     white = white_of(image)
     if white != 255.0:  # gray; Pillow itself keeps the upper byte of 16-bit colour files
         levels = np.asarray(image)  # [H, W]
-        gray = (
-            _floats_as_bytes(image.info[SOURCE], levels)
-            if white == 1.0
-            else (levels >> 8).clip(0, 255).astype(np.uint8)
-        )
+        gray = _floats_as_bytes(_source(image), levels) if white == 1.0 else (levels >> 8).clip(0, 255).astype(np.uint8)
         return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
     mode = "RGBA" if image.has_transparency_data else "RGB"
     return np.array(image if image.mode == mode else image.convert(mode))  # converting would copy it in any case
+
+
+def _source(image: Image.Image) -> str:
+    """Return the path of an opened image, for messages."""
+    return str(image.info.get(SOURCE, "an image"))
 
 
 def _floats_as_bytes(path: str, levels: Floats) -> NDArray[np.uint8]:
@@ -255,7 +260,8 @@ def write_image(path: str | Path, image: NDArray) -> None:
     Parameters
     ----------
     path : str or Path
-        File to make or replace; its suffix chooses the format. JPEGs are of quality 95 without chroma subsampling.
+        File to make or replace; its suffix chooses the format. JPEGs are of quality 95 without chroma subsampling,
+        WebPs of quality 95.
     image : ndarray of shape (H, W), (H, W, 3) or (H, W, 4)
         uint8, bool as black and white, or floats, clipped to [0, 1] and rounded to the nearest of 256 levels.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import find_model, has_model, image_names
-from minisplat_ref.io.images import IMAGE_SUFFIXES
+from minisplat_ref.io.images import BY_PRODUCT, IMAGE_SUFFIXES
 from minisplat_ref.io.names import spelled_on_disk
 from minisplat_ref.io.ply import color_names
 from minisplat_ref.io.ply_file import property_names
@@ -90,7 +90,7 @@ def _images_in(folder: Path) -> set[str]:
     if not folder.is_dir():
         return set()
     paths = (file.relative_to(folder) for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
-    return {path.as_posix() for path in paths if not any(part.startswith((".", "__MACOSX")) for part in path.parts)}
+    return {path.as_posix() for path in paths if not any(map(BY_PRODUCT.fullmatch, path.parts))}
 
 
 def _unused_masks(path: Path, names: Iterable[str]) -> list[str]:

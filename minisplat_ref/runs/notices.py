@@ -16,10 +16,11 @@ from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
 from minisplat_ref.types import FILE_FRAME, Model, Scene
 
 N_SIZES = 3  # of photographs that are all named
+FEW_POINTS = 20  # sparse points that say little about a scene
 SIDE_MIN = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
 
 
-def warn_of_scene(scene: Scene, downscale: int) -> None:
+def warn_of_scene(scene: Scene, downscale: int, *, is_dense: bool = False) -> None:
     """Warn of what a scene lacks for a good training.
 
     Parameters
@@ -27,12 +28,18 @@ def warn_of_scene(scene: Scene, downscale: int) -> None:
     scene : Scene
     downscale : int
         The factor by which its photographs were made smaller.
+    is_dense : bool
+        Whether stereo adds points to the sparse ones.
     """
-    if len(scene.points) <= N_NEIGHBOURS:
+    n = len(scene.points)
+    if n < FEW_POINTS:
+        start = "those that stereo finds in the photographs"
+        if not is_dense:
+            start = f"{n} Gaussians" if n > N_NEIGHBOURS else f"{N_RANDOM_POINTS:,} random ones among the cameras"
         _warn(
-            f"scene {scene.name} has {len(scene.points)} sparse points: training begins with {N_RANDOM_POINTS:,} random"
-            " ones in the space of the cameras and has to find the surfaces by itself; `minisplat-ref sfm PHOTOS` makes"
-            " points, and a transforms.json names a file of them as ply_file_path"
+            f"scene {scene.name} has {n} sparse points: training begins with {start} and has to find the surfaces by"
+            " itself; `minisplat-ref sfm PHOTOS` makes points, and a transforms.json names a file of them as"
+            " ply_file_path"
         )
     sizes = [(view.camera.width, view.camera.height) for view in scene.train_views]
     width, height = min(sizes, key=min)

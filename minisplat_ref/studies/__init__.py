@@ -2,6 +2,7 @@
 
 ==========================  =====================================================================
 :data:`ADAPTIVE`            :mod:`.adaptive`: the recipe that decides for itself, beside those with a schedule
+:data:`FOLDS`               :mod:`.folds`: recipes photograph by photograph, each held out once
 :data:`ABLATION`            :mod:`.ablation`: what each mechanism of Mini-Splatting is worth
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
@@ -55,7 +56,7 @@ _CALIBRATION = (
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that users type; an extension's are EXTENSION/NAME."""
-    studies = (ADAPTIVE, ABLATION, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
+    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
     return {each.name: each for each in studies}
 
 
@@ -85,6 +86,32 @@ ADAPTIVE = declare(
     ),
     SEEDS,
     description=f"Train a scene by adaptive and by recipes with a schedule, as it is and disturbed. {CONTINUES}",
+)
+FOLDS = declare(
+    "folds",
+    "recipes photograph by photograph: each is held out once",
+    f"{__name__}.folds.run",
+    argument("scenes", nargs="+", metavar="SCENE", help="folders of scenes, or synthetic ones"),
+    RESUMED_OUT,
+    number("--folds", 4, "held out is every K-th photograph", minimum=2, metavar="K"),
+    argument(
+        "--recipes",
+        type=list_of(name),
+        default=("adaptive", "3dgs-accel", "mini-splatting", "mini-splatting2"),
+        metavar="R,Q",
+        help="the first is compared with the others; R+NAME=VALUE changes a setting (default: adaptive, and three of"
+        " 3000 iterations)",
+    ),
+    argument(
+        "--photographs",
+        choices=("whole", "thinned", "both"),
+        default="whole",
+        metavar="P",
+        help="whole: all photographs (default); thinned: about ten; both",
+    ),
+    number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
+    SEEDS,
+    description="Hold out each photograph once, train recipes on the others, and measure. " + CONTINUES,
 )
 ABLATION = declare(
     "ablation",

@@ -6,7 +6,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.dense_start import densify_points
+from minisplat_ref.training.schedule import Recipe, settings_of
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
 
@@ -29,6 +30,8 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
+    if recipe.starts_densely:
+        scene = _with_dense_points(scene, settings_of(recipe).get("budget"))
     gaussians = contiguous(representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng))
     shared = dict(representation.shared(scene, rng))
     for calibration in recipe.active_calibrations:
@@ -51,6 +54,15 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         shared_adam=zero_moments(shared),
         frame=scene.frame,
     )
+
+
+def _with_dense_points(scene: Scene, budget: int | None) -> Scene:
+    """Return the scene with stereo's points besides its own, evenly chosen if there are more than the budget allows."""
+    points, colors = densify_points(scene)
+    n_own, n = len(scene.points), len(points)
+    room = n - n_own if budget is None else min(max(budget - n_own, 0), n - n_own)
+    rows = np.concatenate([np.arange(n_own), np.linspace(n_own, n - 1, room).astype(int)])
+    return scene._replace(points=points[rows], point_colors=colors[rows])
 
 
 def check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:

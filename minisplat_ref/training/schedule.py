@@ -25,6 +25,9 @@ from minisplat_ref.types import Model
 Action = Callable[..., str | None]
 """``action(state, iteration)``; see :mod:`minisplat_ref.training.state`. Its settings are bound with ``partial``."""
 
+START = "starts_densely"
+"""The setting of :attr:`Recipe.starts_densely`."""
+
 BLEND_STATS = frozenset({"stats"})
 """For ``During.wants``: the action finds blend statistics in ``iteration.output.stats``."""
 
@@ -159,6 +162,8 @@ class Recipe(NamedTuple):
     """Parameters of each photograph, and a sky; all are off unless asked for."""
     representation: Representation = GAUSSIANS
     """What is trained and how it is rendered."""
+    starts_densely: bool = False
+    """Begin with stereo's points, too, not with the sparse points alone (:mod:`minisplat_ref.training.dense_start`)."""
     cooling: Cooling | None = None
     """How a method without a schedule ends: its milestones do not scale with the length, and ``iterations`` is a limit.
     None for methods with a schedule."""
@@ -266,13 +271,15 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return the settings that :func:`configure` can replace, each with its present value, the first of several.
 
     Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names;
-    the weight of a loss term by the term's name; whether a calibration is on by the calibration's name.
+    the weight of a loss term by the term's name; whether a calibration is on by the calibration's name; and
+    ``starts_densely``.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
     representation = [_settings(recipe.representation.extend), _settings(recipe.representation.renderer.render)]
-    found = [*events, *terms, *switches, *representation]
+    start = [{START: recipe.starts_densely}]
+    found = [*events, *terms, *switches, *representation, *start]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
@@ -301,6 +308,7 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
                 for calibration in recipe.calibrations
             ),
             representation=_with_setting(recipe.representation, name, value),
+            starts_densely=value if name == START else recipe.starts_densely,
         )
     return recipe
 

@@ -1,9 +1,11 @@
 """What a person is told of input that is odd but not broken: one line that says what it means for the run."""
 
+import shlex
 import shutil
 import struct
 import warnings
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,12 +15,13 @@ from minisplat_ref import Gaussians, io, save_ply
 from minisplat_ref.cli import main, train
 from minisplat_ref.cli import sfm as sfm_command
 from minisplat_ref.datasets import sfm
-from minisplat_ref.datasets.downscale import list_images
+from minisplat_ref.datasets.photo_files import list_images
+from minisplat_ref.datasets.sfm.mapping import MAPPERS, Mapped
+from minisplat_ref.datasets.sfm.photographs import Group
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io import images as images_module
 from minisplat_ref.io import load_ply, load_scene, read_image
 from minisplat_ref.io.images import PIXELS_MAX, image_size, is_turned, write_image
-from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.runs import first_use
 from minisplat_ref.runs.notices import warn_of_model, warn_of_scene
 from minisplat_ref.types import Model
@@ -138,14 +141,19 @@ def test_scene_without_points(tmp_path, recwarn):
     scene = load_scene(write_transforms(tmp_path, fl_x=40.0))
     with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with 100,000 random ones .* ply_file"):
         warn_of_scene(scene, 1)
-    points = np.random.default_rng(0).normal(size=(4, 3))
-    warn_of_scene(scene._replace(points=points, point_colors=np.zeros((4, 3), np.uint8)), 1)
+    with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with those that stereo finds"):
+        warn_of_scene(scene, 1, is_dense=True)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    with pytest.warns(InputWarning, match=r"has 4 sparse points: training begins with 4 Gaussians and has to find"):
+        warn_of_scene(scene._replace(points=points[:4]), 1)
+    recwarn.clear()
+    warn_of_scene(scene._replace(points=points), 1)
     assert not recwarn.list
 
 
 def test_photographs_of_a_few_pixels(tmp_path):
     scene = load_scene(write_colmap(tmp_path), downscale=1000)
-    scene = scene._replace(points=np.zeros((4, 3)))
+    scene = scene._replace(points=np.zeros((20, 3)))
     with pytest.warns(InputWarning, match="are 1 x 1 pixels after --downscale 1000: give a smaller number; from fewer"):
         warn_of_scene(scene, 1000)
     with pytest.warns(InputWarning, match="are 1 x 1 pixels: give larger ones; from fewer than 16 x 16 hardly any"):
@@ -205,44 +213,75 @@ def test_kernels_that_cannot_be_kept(tmp_path, monkeypatch, recwarn):
 
 # structure from motion
 
+GROUP = Group(1024, 768, "Maker A", 4.3, 35.0)
+RESULT = sfm.SfmResult(
+    n_photos=15,
+    left_out=tuple(f"{i}.jpg" for i in range(7)),
+    n_points=1234,
+    error=0.5,
+    kept=Mapped("global", "dense", None, 8, 1234, (4, 3), 990),
+    others=(Mapped("incremental", "standard", None, 5, 800, (2,), 500), Mapped("global", "standard", None, 0, 0, ())),
+    n_matches=1000,
+    groups={GROUP: 9, Group(768, 1024, "", None, None): 6},
+    n_masks=2,
+    sizes=((1600, 1200),) * 7 + ((1200, 1600),),
+)
 
-def test_partial_scene_names_what_is_left_out_and_what_helps(tmp_path, capsys, monkeypatch):
-    result = sfm.SfmResult(15, tuple(f"{i}.jpg" for i in range(7)), (4, 3), 1234, 0.5)
-    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: result)
-    assert main(["sfm", "photos", "--out", "scene"]) == 0
-    first, left_out, groups, advice = capsys.readouterr().out.splitlines()
-    assert first == "scene: 8 of 15 photographs (53%), 1234 points, reprojection error 0.50 px"
-    assert left_out == "without a place: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg"
-    assert groups == "groups that fit together, but not with the scene: of 4 and of 3 photographs"
+
+def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: RESULT)
+    assert main(["sfm", "photos", "--out", "my scene"]) == 0
+    *lines, advice, cameras, masks, sizes, following = capsys.readouterr().out.splitlines()
+    assert lines == [
+        "my scene: 8 of 15 photographs (53%), 1234 points, reprojection error 0.50 px",
+        "kept: global mapper with dense features: 8 photographs, 1234 points; explains 99% of the matches",
+        "not kept: incremental mapper with standard features: 5 photographs, 800 points; explains 50% of the matches",
+        "not kept: global mapper with standard features, which places no photographs",
+        "without a place: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg",
+        "groups that fit together, but not with the scene: of 4 and of 3 photographs",
+    ]
     assert advice.startswith("what usually helps: more photographs between")
-    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: result._replace(left_out=(), other_groups=()))
-    assert main(["sfm", "photos", "--out", "scene"]) == 0
-    assert capsys.readouterr().out == "scene: 15 of 15 photographs (100%), 1234 points, reprojection error 0.50 px\n"
+    assert cameras == (
+        "one camera for each size, camera and focal length: 9 of 1024 x 768, Maker A, 4.3 mm, 35 mm on 35 mm film;"
+        " 6 of 768 x 1024"
+    )
+    assert masks == "masks: of 2 photographs; no features were looked for where they are black"
+    assert sizes == (
+        "photographs of 1600 x 1200 (7 of them) and 1200 x 1600 (1 of them) pixels; begin at 533 x 400, which a laptop"
+        " trains in minutes"
+    )
+    folder = str(tmp_path / "my scene"), str(tmp_path / "runs" / "my scene")
+    assert following.startswith("next: ")
+    assert following.endswith(f" train {shlex.quote(folder[0])} --downscale 3 --out {shlex.quote(folder[1])}")
 
 
-class Placed:
-    def __init__(self, n):
-        self.n = n
-
-    def num_reg_images(self):
-        return self.n
+def test_summary_names_only_what_is_there(tmp_path, capsys, monkeypatch):
+    plain = RESULT._replace(left_out=(), groups={GROUP: 15}, n_masks=0, sizes=((480, 320),) * 15)
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: plain)
+    assert main(["sfm", "photos", "--out", str(tmp_path / "scene")]) == 0
+    first, kept, *others, sizes, following = capsys.readouterr().out.splitlines()
+    assert ": 15 of 15 photographs (100%), " in first
+    assert kept.startswith("kept: ") and len(others) == 2
+    assert sizes == "photographs of 480 x 320 pixels"
+    assert "--downscale" not in following
 
 
 @pytest.mark.parametrize("matching", sfm_command.MATCHINGS)
-@pytest.mark.parametrize("sizes", [(2,), (1, 2), (3, 2)])
-def test_hardly_any_photograph_finds_a_place(tmp_path, capsys, monkeypatch, matching, sizes):
-    pycolmap = import_pycolmap()
-    for name in ("extract_features", "match_exhaustive", "match_sequential"):
-        monkeypatch.setattr(pycolmap, name, lambda *_, **__: None)
-    models = {i: Placed(n) for i, n in enumerate(sizes)}
-    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: models)
+@pytest.mark.parametrize("n", [2, 3])
+def test_hardly_any_photograph_finds_a_place(tmp_path, capsys, monkeypatch, matching, n):
+    monkeypatch.setattr(sfm, "find_features", lambda *_: None)
+    monkeypatch.setattr(sfm, "match_features", lambda *_: None)
+    monkeypatch.setattr(sfm, "read_matches", lambda *_: [])
+    results = [Mapped(name, "standard", SimpleNamespace(images={}), n, 9, ()) for name in MAPPERS]
+    monkeypatch.setattr(sfm, "map_photographs", lambda *_: results)
     (tmp_path / "photos").mkdir()
     for i in range(15):
         write_image(tmp_path / "photos" / f"{i}.png", colored_image(i))
     out = tmp_path / "out"
-    assert main(["sfm", str(tmp_path / "photos"), "--out", str(out), "--matching", matching]) == 2
+    options = ["--matching", matching, "--features", "standard"]
+    assert main(["sfm", str(tmp_path / "photos"), "--out", str(out), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    n = max(sizes)
     assert f"photos: {n} of 15 photographs ({n / 15:.0%}) found a place, too few for a scene; " in line
     assert ("use --matching exhaustive" in line) == (matching == "sequential")
     assert not out.exists()
@@ -257,8 +296,8 @@ def test_photographs_of_two_places(shared_data, tmp_path, capsys):
     for i, name in enumerate(sorted((shared_data / "fox" / "images").iterdir())[:50:49]):
         shutil.copy(name, photos / f"fox{i}.JPEG")
     assert main(["sfm", str(photos), "--out", str(tmp_path / "scene"), "--long-side", "512"]) == 0
-    first, left_out, *_, advice = capsys.readouterr().out.splitlines()
-    assert ": 4 of 6 photographs (67%), " in first
-    assert left_out == "without a place: fox0.JPEG, fox1.JPEG"
-    assert advice == sfm.advice("exhaustive")
+    lines = capsys.readouterr().out.splitlines()
+    assert ": 4 of 6 photographs (67%), " in lines[0]
+    assert "without a place: fox0.JPEG, fox1.JPEG" in lines
+    assert sfm.advice("exhaustive") in lines
     assert len(load_scene(tmp_path / "scene", test_every=0).train_views) == 4

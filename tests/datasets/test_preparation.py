@@ -1,4 +1,4 @@
-"""The commands that prepare scenes: downscaling, undistortion, structure from motion."""
+"""The commands that prepare scenes: downscaling and undistortion; structure from motion has its own file."""
 
 import json
 import shutil
@@ -8,29 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
 
 from minisplat_ref.cli import main
-from minisplat_ref.datasets.sfm import prepare_photos
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, resize_image, write_image
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.ply import write_vertices
-from photo_scenes import HEIGHT, WIDTH, colored_image, sparse_color_errors, write_colmap, write_transforms
-from tolerances import COLOR_RATIO, SAME_CAMERAS, SFM_CENTERS
+from photo_scenes import HEIGHT, WIDTH, assert_refused, colored_image, write_colmap, write_transforms
+from tolerances import SAME_CAMERAS, WEBP_LEVELS
 
 ROOT = Path(__file__).parents[2]
 DISTORTED = (40.0, 42.0, 16.0, 12.0, 0.1, -0.05, 0.004, -0.003)  # OPENCV
 NERFSTUDIO = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), DISTORTED, strict=True))
-
-
-def assert_refused(capsys, folder, code, message):
-    """Exit code 2, one line that says why, and nothing new in the folder."""
-    assert code == 2
-    error = capsys.readouterr().err
-    assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1
-    assert message in error
-    assert not [path for path in folder.rglob("*") if path.name.startswith(".") or path.name == "out"]
 
 
 def assert_same_views(scene, other, check_images):
@@ -127,6 +116,38 @@ def test_undistort_transforms_agrees_with_loading_undistorted(tmp_path, rng):
     assert json.loads((tmp_path / "out" / "transforms.json").read_text())["aabb_scale"] == 4
 
 
+def test_undistort_what_colmap_does_not_write(tmp_path, rng):
+    """COLMAP leaves out WebP photographs and says nothing."""
+    names = ["0.webp", "1.png", "2.webp"]
+    scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED, names=names)
+    alpha = np.where(rng.random((HEIGHT, WIDTH)) < 0.5, 255, 0).astype(np.uint8)
+    write_image(scene / "images" / "2.webp", np.dstack([colored_image(2), alpha]))
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "out")]) == 0
+    undistorted, expected = load_scene(tmp_path / "out"), load_scene(scene, undistort=True)
+    assert_same_views(undistorted, expected, check_images=False)
+    for view, same in zip(undistorted.train_views, expected.train_views, strict=True):
+        assert np.abs(view.image.astype(int) - same.image).mean() < WEBP_LEVELS
+    assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == names
+    assert [path.name for path in (tmp_path / "out" / "masks").iterdir()] == ["2.webp.png"]
+
+
+def test_undistort_names_what_colmap_leaves_out(tmp_path, capsys, monkeypatch):
+    scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
+    pycolmap = import_pycolmap()
+    original = pycolmap.undistort_images
+
+    def without_the_second(out, *arguments, **named):
+        original(out, *arguments, **named)
+        model = pycolmap.Reconstruction(Path(out, "sparse"))
+        (image,) = (image for image in model.images.values() if image.name == "0001.png")
+        model.deregister_frame(image.frame_id)
+        model.write(Path(out, "sparse"))
+
+    monkeypatch.setattr(pycolmap, "undistort_images", without_the_second)
+    code = main(["undistort", str(scene), "--out", str(tmp_path / "out")])
+    assert_refused(capsys, tmp_path, code, "scene: COLMAP has not undistorted 0001.png; export the model again")
+
+
 def test_undistort_refuses(tmp_path, capsys):
     pinhole = write_colmap(tmp_path / "pinhole")
     code = main(["undistort", str(pinhole), "--out", str(tmp_path / "out")])
@@ -152,95 +173,6 @@ def test_interruption_leaves_nothing(tmp_path, capsys, monkeypatch):
     assert main(["undistort", str(scene), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "minisplat-ref: interrupted\n"
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
-
-
-# sfm
-
-
-def test_photographs_are_turned_upright_and_shrunk(tmp_path, rng):
-    image = rng.integers(0, 256, (20, 40, 3), dtype=np.uint8)
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6  # turn clockwise to show it
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 50
-    exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitudeRef] = "N"
-    photos, target = tmp_path / "photos", tmp_path / "target"
-    photos.mkdir()
-    Image.fromarray(image).save(photos / "a.PNG", exif=exif)
-    Image.fromarray(image).save(photos / "b.JPEG", exif=exif)
-    sizes = prepare_photos(sorted(photos.iterdir()), photos, target, 40)
-    assert sizes == {"a.png": (20, 40), "b.jpg": (20, 40)}
-    np.testing.assert_array_equal(read_image(target / "a.png"), np.rot90(image, -1))
-    with Image.open(target / "b.jpg") as copy:
-        assert ExifTags.Base.Orientation not in copy.getexif()
-        assert not copy.getexif().get_ifd(ExifTags.IFD.GPSInfo)
-    camera = import_pycolmap().infer_camera_from_image(target / "b.jpg")
-    assert camera.has_prior_focal_length
-    assert prepare_photos(sorted(photos.iterdir()), photos, tmp_path / "small", 10)["a.png"] == (5, 10)
-
-
-def run_on_banana(shared_data, tmp_path, names):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for name in names:
-        shutil.copy(shared_data / "banana" / "images" / name, photos)
-    return main(["sfm", str(photos), "--out", str(tmp_path / "scene"), "--long-side", "512"])
-
-
-def check_sfm(shared_data, folder, n_min):
-    """Cameras agree with those from larger photographs, up to a similarity, and the points with the pixels."""
-    scene = load_scene(folder, test_every=0)
-    truth = {view.name: view.camera for view in load_scene(shared_data / "banana", test_every=0).train_views}
-    assert len(scene.train_views) >= n_min
-    a, b = (
-        np.stack([-c.cam_from_world_R.T @ c.cam_from_world_t for c in cameras])
-        for cameras in ([v.camera for v in scene.train_views], [truth[v.name] for v in scene.train_views])
-    )
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    b_from_a = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    scale = np.vdot(b, a @ b_from_a.T) / np.vdot(a, a)
-    assert np.linalg.norm(scale * a @ b_from_a.T - b, axis=1).max() < SFM_CENTERS * np.linalg.norm(b, axis=1).max()
-    error, shuffled = sparse_color_errors(scene)
-    assert error < COLOR_RATIO * shuffled
-
-
-def test_sfm_of_four_photographs(shared_data, tmp_path, capsys):
-    assert run_on_banana(shared_data, tmp_path, [f"DSC_04{i}.jpg" for i in (23, 24, 25, 38)]) == 0
-    assert "4 of 4 photographs" in capsys.readouterr().out
-    check_sfm(shared_data, tmp_path / "scene", 4)
-    assert sorted(path.name for path in (tmp_path / "scene").iterdir()) == ["images", "sparse"]
-
-
-@pytest.mark.slow
-def test_sfm_of_all_photographs(shared_data, tmp_path):
-    names = [path.name for path in (shared_data / "banana" / "images").iterdir()]
-    assert run_on_banana(shared_data, tmp_path, names) == 0
-    check_sfm(shared_data, tmp_path / "scene", 8)
-
-
-def test_sfm_refuses(tmp_path, capsys):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    out = ["--out", str(tmp_path / "out")]
-    assert_refused(capsys, tmp_path, main(["sfm", str(tmp_path / "nowhere"), *out]), "no such folder; give a folder")
-    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "no images in it (looked for .png .jpg")
-    write_image(photos / "a.png", colored_image(1))
-    assert_refused(
-        capsys, tmp_path, main(["sfm", str(photos), *out]), "1 photograph, structure from motion needs at least 2"
-    )
-    write_image(photos / "b.png", colored_image(2))
-    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out, "--long-side", "0"]), "--long-side is 0")
-    assert_refused(
-        capsys, tmp_path, main(["sfm", str(photos), *out]), "no two photographs could be placed; take them with more"
-    )
-    write_image(photos / "b.jpg", colored_image(2))
-    (photos / "b.png").rename(photos / "b.bmp")
-    assert_refused(
-        capsys, tmp_path, main(["sfm", str(photos), *out]), "another photograph is called b.jpg; give each its own"
-    )
-    (photos / "b.bmp").unlink()
-    (photos / "b.jpg").write_text("no image")
-    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "b.jpg: not an image that Pillow can read")
 
 
 def test_pycolmap_is_missing(tmp_path, capsys, monkeypatch):

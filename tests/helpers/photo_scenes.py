@@ -82,3 +82,12 @@ def sparse_color_errors(scene):
         errors.append(np.abs(found - expected).mean())
         shuffled.append(np.abs(found - np.roll(expected, len(expected) // 2, axis=0)).mean())
     return np.mean(errors), np.mean(shuffled)
+
+
+def assert_refused(capsys, folder, code, message):
+    """Exit code 2, one line that says why, and nothing new in the folder."""
+    assert code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1
+    assert message in error
+    assert not [path for path in folder.rglob("*") if path.name.startswith(".") or path.name == "out"]

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io import load_colmap, load_scene
 from minisplat_ref.io.images import resize_image, write_image
 from minisplat_ref.io.lens import import_pycolmap
@@ -304,6 +304,16 @@ BAD_SCENES = {
     ),
     "NaN": (rewrite("cameras.txt", "15.5", "nan"), {}, r"damaged or incomplete|png is not usable \(fx"),  # by version
     "infinite pose": (rewrite("images.txt", " -2.0 ", " inf "), {}, r"damaged or incomplete|pose of 0002\.png is not"),
+    "no empty lines": (
+        rewrite("images.txt", "\n\n", "\n"),
+        {},
+        r"images\.txt: 4 images, of which 2 can be read: each needs a second line .* add the empty lines",
+    ),
+    "no last line": (
+        rewrite("images.txt", "0000.png\n\n", "0000.png\n"),
+        {},
+        r"images\.txt: 4 images, of which 3 can be read: each needs a second line",
+    ),
     "all held out": (
         lambda folder: None,
         {"test_every": 1},
@@ -323,6 +333,18 @@ def test_bad_scene(tmp_path, name):
     with pytest.raises(InputError, match=message) as caught:
         load_colmap(tmp_path, **arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_heading_of_a_text_model_states_more_images(tmp_path, recwarn):
+    """A model that was cut, or shortened by hand."""
+    images = write_colmap(tmp_path) / "sparse" / "0" / "images.txt"
+    lines = images.read_text()
+    images.write_text(f"# Number of images: 4, mean observations per image: 0\n{lines}")
+    assert len(load_colmap(tmp_path, test_every=0).train_views) == 4
+    assert not recwarn.list
+    images.write_text(f"# Number of images: 8, mean observations per image: 0\n{lines}")
+    with pytest.warns(InputWarning, match=r"images\.txt: 4 images, though its heading says 8; export the model again"):
+        load_colmap(tmp_path)
 
 
 @pytest.mark.parametrize("n", [1, 2])

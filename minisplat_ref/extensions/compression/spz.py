@@ -53,6 +53,7 @@ VERSIONS = (3, 2)  # as levels: the finest first
 FRACTIONAL_BITS, FRACTIONAL_BITS_MAX = 12, 23
 STEP_MAX = 0.1  # of the median of the largest scales; the step of 12 bits is about 0.02 of it in a usual scene
 LOG_SCALE_MIN = -10.0
+SMALLER_SHARE = 0.01  # of the Gaussians, from which on it is said that they are smaller than that
 COLOR_SCALE = 0.15
 SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
 GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
@@ -136,6 +137,12 @@ def _fractional_bits(means: Floats, log_scales: Floats) -> int:
             f"SPZ holds scales from {math.exp(LOG_SCALE_MIN):.2g} on, but {n_smaller:,} of {len(sizes):,} Gaussians are"
             f" smaller, the median is {size:.2g}: scale the scene, or choose another format"
         )
+    if n_smaller > SMALLER_SHARE * len(sizes):
+        message = (
+            f"SPZ holds scales from {math.exp(LOG_SCALE_MIN):.2g} on: {n_smaller:,} of {len(sizes):,} Gaussians are"
+            " smaller, and become larger"
+        )
+        warnings.warn(one_line(message), InputWarning, stacklevel=3)
     bits_max = FRACTIONAL_BITS_MAX
     while bits_max >= 0 and math.floor(reach * 2.0**bits_max + 0.5) >= 2**23:
         bits_max -= 1

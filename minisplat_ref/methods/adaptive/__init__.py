@@ -20,6 +20,11 @@ at twice the size; when they are as they were taken, rates fall and all training
 *Ask the photographs.* A sky, exposures, refined poses and compensated opacities are each switched on once, and only if
 one half of the photographs, or of each photograph, shows the other half what it gains by them.
 
+*Begin densely.* Stereo adds surface points where structure from motion has found few
+(:mod:`minisplat_ref.training.dense_start`).
+
+*Look through.* Gaussians that stand before sparse points which photographs show are removed every 100 iterations.
+
 *Prune.* While the rates fall, what the photographs would hardly miss is removed in slices.
 
 ================  ==================================================================================================
@@ -34,6 +39,7 @@ one half of the photographs, or of each photograph, shows the other half what it
 ``pose``          the pose of each photograph
 ``antialiasing``  compensated opacities, where photographs differ in resolution
 ``sky``           a sky behind the scene
+``veils``         Gaussians before sparse points that photographs show, which are removed
 ``prune``         what is removed while the rates fall
 ================  ==================================================================================================
 """

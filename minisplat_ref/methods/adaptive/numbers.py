@@ -109,6 +109,18 @@ OPEN = 0.5
 OPEN_MIN = 0.005
 """Fraction of a photograph's pixels that must be open: fewer say nothing."""
 
+# --- veils ---
+
+VEIL_SHARE = 0.5
+"""Of a Gaussian's weight on the rays of sparse points, above which it is a veil: more of it is before the points than
+at or behind them."""
+VEIL_WEIGHT_MIN = 0.1
+"""Weight before points, in opaque pixels, below which a Gaussian is left alone: a tenth of one pixel."""
+VEIL_START = 500
+"""Iteration before which nothing is removed: until then Gaussians are large and lie on several surfaces."""
+VEIL_VIEWS_MAX = 24
+"""Training views that are looked at each time, at most, so that this takes a small part of the time."""
+
 # --- pruning ---
 
 SEEN_BY_MIN = 2

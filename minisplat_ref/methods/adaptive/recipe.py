@@ -15,6 +15,7 @@ from minisplat_ref.methods.adaptive.switches import (
     switch_pose_on,
     switch_sky_on,
 )
+from minisplat_ref.methods.adaptive.veils import remove_veils
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, prune_faint
 from minisplat_ref.strategy.halving import OFFSET
 from minisplat_ref.training.adam import AdamRule
@@ -65,6 +66,14 @@ ADAPTIVE = GS._replace(
             )
         ),
         _regularly(partial(prune_faint, min_opacity=numbers.FAINT)),
+        _regularly(
+            partial(
+                remove_veils,
+                max_share_before=numbers.VEIL_SHARE,
+                min_weight_before=numbers.VEIL_WEIGHT_MIN,
+                start=numbers.VEIL_START,
+            )
+        ),
         During(
             partial(
                 prune_in_slices,
@@ -76,6 +85,7 @@ ADAPTIVE = GS._replace(
         During(partial(cut_degrees_when_cooling, min_variation=numbers.VARIATION_MIN)),
     ),
     min_views=numbers.TRAIN_VIEWS_MIN,
+    starts_densely=True,
     cooling=Cooling(
         numbers.COOLING_PART, numbers.COOLING_LAST, numbers.COOLING_LAST_PER_EXTENT, numbers.HOLD_OUT_EVERY
     ),

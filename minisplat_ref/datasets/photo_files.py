@@ -1,0 +1,76 @@
+"""Find the photographs in a folder, and leave out what programs have put beside them.
+
+Cameras, phones and file managers leave previews and hidden copies (``._0001.jpg`` of macOS, ``@eaDir`` of a network
+disk, ``.thumbnails``). A scene has masks and smaller copies (``masks/``, ``images_2/``). They end like photographs, but
+are none.
+"""
+
+import re
+import warnings
+from collections import Counter
+from pathlib import Path
+
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.images import BY_PRODUCT, IMAGE_SUFFIXES
+
+UNREAD_SUFFIXES = (
+    *(".heic", ".heif", ".avif", ".jxl"),
+    *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
+)
+"""Formats of phones and cameras that Pillow does not decode."""
+MASKS = "masks"
+"""Folder of masks beside the photographs."""
+SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
+NAMED_MAX = 20  # files that a message names
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Return the photographs in a folder and below, sorted by name; masks are none.
+
+    Warns of photographs in formats that are not read, and of image files that are hidden or by-products.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or no photograph in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give a folder with photographs")
+    found = sorted(file.relative_to(folder) for file in folder.rglob("*") if file.is_file())
+    found = [file for file in found if MASKS not in file.parent.parts]
+    sorted_out = [(file, _by_product(folder, file)) for file in found]
+    photos = [file for file, by_product in sorted_out if by_product is None]
+    by_products = [(file, by_product) for file, by_product in sorted_out if by_product is not None]
+    files = [folder / file for file in photos if file.suffix.lower() in IMAGE_SUFFIXES]
+    others = [str(file) for file in photos if file.suffix.lower() in UNREAD_SUFFIXES]
+    problems = []
+    if others:
+        problems.append(
+            f"{len(others)} photographs of formats that are not read ({enumerate_names(others)}): convert them to JPEG"
+        )
+    left_out = Counter(by_product for file, by_product in by_products if file.suffix.lower() in IMAGE_SUFFIXES)
+    if left_out:
+        names = enumerate_names([name if n == 1 else f"{name} with {n} images" for name, n in left_out.items()])
+        problems.append(f"what is hidden or a by-product of other programs ({names})")
+    if not files:
+        instead = f", but {' and '.join(problems)}" if problems else ""
+        raise InputError(f"{folder}: no images in it (looked for {' '.join(IMAGE_SUFFIXES)}){instead}")
+    for problem in problems:
+        warnings.warn(one_line(f"{folder}: leaving out {problem}"), InputWarning, stacklevel=2)
+    return files
+
+
+def _by_product(folder: Path, file: Path) -> str | None:
+    """Return the path to the first part that is hidden or a by-product; None if there is none."""
+    for i, part in enumerate(file.parts, 1):
+        path = Path(*file.parts[:i])
+        is_smaller = SMALLER.fullmatch(part) and (folder / path).with_name("images").is_dir()
+        if is_smaller or BY_PRODUCT.fullmatch(part):
+            return path.as_posix() + ("/" if i < len(file.parts) else "")
+    return None
+
+
+def enumerate_names(names: list[str]) -> str:
+    """Return names between commas, the first NAMED_MAX of them."""
+    rest = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+    return f"{', '.join(names[:NAMED_MAX])}{rest}"

@@ -1,0 +1,175 @@
+"""Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by COLMAP.
+
+Photographs are rotated upright and shrunk (:mod:`.photographs`), features are found and matched (:mod:`.features`), two
+mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. What is left is a COLMAP
+scene with pinhole cameras: ``images/``, ``sparse/0/``, and ``masks/`` if there were masks. Photographs that could not
+be placed are named and left out.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from minisplat_ref.datasets.sfm.features import (
+    DENSE,
+    STANDARD,
+    Features,
+    Pair,
+    find_features,
+    match_features,
+    overlapping_pairs,
+    pairs_to_match,
+)
+from minisplat_ref.datasets.sfm.judging import Matches, choose, read_matches
+from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
+from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
+from minisplat_ref.datasets.undistort import undistort_colmap
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.colmap import colmap_photos
+
+PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
+POINTS_MIN = 150  # for each photograph; with fewer, dense features are tried
+
+
+class SfmResult(NamedTuple):
+    """The result, for the report."""
+
+    n_photos: int
+    """Photographs that were given."""
+    left_out: tuple[str, ...]
+    """Names of those that could not be placed, in the folder of photographs."""
+    n_points: int
+    """Sparse points."""
+    error: float
+    """Mean reprojection error before undistortion, pixels."""
+    kept: Mapped
+    """The result that was kept, without its model."""
+    others: tuple[Mapped, ...]
+    """The other results, without their models: of the other mapper, and of other features if they were tried."""
+    n_matches: int
+    """Verified matches, with which the results were judged."""
+    groups: dict[Group, int]
+    """Photographs that share a camera."""
+    n_masks: int
+    """Photographs with a mask."""
+    sizes: tuple[tuple[int, int], ...]
+    """Width and height of each photograph in the scene, pixels."""
+
+
+def run_sfm(
+    photos: Path,
+    out: Path,
+    *,
+    long_side: int = 1600,
+    matching: str = "exhaustive",
+    features: str = "auto",
+    camera_model: str = "SIMPLE_RADIAL",
+) -> SfmResult:
+    """Make a COLMAP scene with pinhole cameras from photographs, complete or not at all.
+
+    Parameters
+    ----------
+    photos : Path
+        Folder of photographs.
+    out : Path
+        Folder to make.
+    long_side : int
+        Photographs with a longer side are shrunk to this, pixels.
+    matching : str
+        "exhaustive": every pair. "sequential": neighbours in the order of file names, for videos.
+    features : str
+        "standard": COLMAP's own setting. "dense": more features, matched more thoroughly, which takes longer. "auto":
+        standard, then dense if that leaves photographs without a place or gives few points; the better result is kept.
+    camera_model : str
+        COLMAP model that is estimated, for each group of photographs with one size, camera and focal length.
+
+    Returns
+    -------
+    SfmResult
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two photographs, one cannot be read, or hardly any finds a place.
+    """
+    if long_side < 1:
+        raise InputError(f"--long-side is {long_side}; it must be positive")
+    with making_folder(out) as folder, TemporaryDirectory(dir=folder) as temporary:
+        work = Path(temporary)
+        photographs = prepare_photos(photos, work, long_side)
+        n_photos = len(photographs.originals)
+        if n_photos < 2:
+            raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")
+        best, others, n_matches = _reconstruct(photographs, work, matching, features, camera_model)
+        _check_placed(best, n_photos, photos, matching)
+        (work / "sparse" / "0").mkdir(parents=True)
+        best.model.write(work / "sparse" / "0")
+        written = undistort_colmap(work, colmap_photos(work, best.model), folder)
+    placed = {image.name for image in best.model.images.values() if image.has_pose}
+    return SfmResult(
+        n_photos=n_photos,
+        left_out=tuple(str(original) for name, original in photographs.originals.items() if name not in placed),
+        n_points=best.n_points,
+        error=best.model.compute_mean_reprojection_error(),
+        kept=best._replace(model=None),
+        others=tuple(other._replace(model=None) for other in others),
+        n_matches=n_matches,
+        groups={group: len(names) for group, names in photographs.groups.items()},
+        n_masks=len(photographs.masked),
+        sizes=tuple((photo.camera.width, photo.camera.height) for photo in written),
+    )
+
+
+def _reconstruct(
+    photographs: Photographs, work: Path, matching: str, features: str, camera_model: str
+) -> tuple[Mapped, list[Mapped], int]:
+    """Return the best result, the others, and the number of matches with which they were judged."""
+    all_pairs = pairs_to_match(list(photographs.originals), matching)
+
+    def attempt(kind: Features, pairs: list[Pair]) -> tuple[list[Mapped], list[Matches]]:
+        folder = work / kind.name
+        folder.mkdir()
+        database = folder / "database.db"
+        find_features(database, photographs, kind, camera_model)
+        match_features(database, folder, pairs, kind)
+        n_photos = len(photographs.originals)
+        return map_photographs(database, photographs.images, folder, kind.name, n_photos), read_matches(database)
+
+    results, matches = attempt(STANDARD, all_pairs)
+    best, others = choose(results, matches)
+    n_photos = len(photographs.originals)
+    is_enough = best.n_placed == n_photos and best.n_points >= POINTS_MIN * n_photos
+    if features == "dense" or (features == "auto" and not is_enough):
+        images = [] if best.model is None else best.model.images.values()
+        placed = frozenset(image.name for image in images if image.has_pose)
+        pairs = overlapping_pairs(work / STANDARD.name / "database.db", all_pairs, placed)
+        dense, matches = attempt(DENSE, pairs)
+        best, others = choose(dense if features == "dense" else [best, *others, *dense], matches)
+    return best, others, sum(len(pair.first) for pair in matches)
+
+
+def _check_placed(best: Mapped, n_photos: int, photos: Path, matching: str) -> None:
+    """Refuse a result that is no scene of the photographs."""
+    if best.model is None:
+        raise InputError(
+            f"{photos}: no two photographs could be placed; take them with more overlap, of something with texture"
+        )
+    if best.n_placed < max(min(n_photos, PHOTOS_MIN), SHARE_MIN * n_photos):
+        raise InputError(
+            f"{photos}: {best.n_placed} of {n_photos} photographs ({best.n_placed / n_photos:.0%}) found a place, too"
+            f" few for a scene; {advice(matching)}"
+        )
+
+
+def advice(matching: str) -> str:
+    """Return what usually helps photographs that could not be placed after this kind of matching."""
+    if matching == "sequential":
+        return (
+            "--matching sequential compares neighbours in the order of file names, which suits frames of a video; for"
+            " other photographs use --matching exhaustive"
+        )
+    return (
+        "what usually helps: more photographs between those that do not join, so that each shares most of its view with"
+        " two others; sharp ones, with a step to the side between shots; a subject with texture that does not move"
+    )

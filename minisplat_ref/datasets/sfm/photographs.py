@@ -1,0 +1,182 @@
+"""Prepare photographs for structure from motion: upright and shrunk copies, their masks, and which share a camera.
+
+Photographs share a camera if size, make, model and focal length agree: another zoom setting is another camera. What the
+EXIF data do not say counts as equal. Copies keep the focal length, COLMAP's initial value; location and time are left
+out. An alpha channel is a mask, and so is a file in ``masks/`` beside the photographs, as COLMAP names it
+(``0001.jpg.png``) or by the name alone (``0001.png``).
+"""
+
+import math
+import re
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import ExifTags, Image, ImageOps
+from tqdm import tqdm
+
+from minisplat_ref.datasets.photo_files import MASKS, enumerate_names, list_images
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.images import (
+    MASK_THRESHOLD,
+    SAVE_OPTIONS,
+    open_image,
+    pixels_of,
+    read_mask,
+    resize_mask,
+    write_image,
+)
+from minisplat_ref.types import Bools
+
+CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
+FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+
+
+class Group(NamedTuple):
+    """What photographs of one camera have in common, of their copies and from their EXIF data."""
+
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    camera: str
+    """Make and model, "" if unknown."""
+    focal: float | None
+    """Focal length, mm, None if unknown."""
+    focal_35: float | None
+    """Focal length with the same angle of view on 35 mm film, mm, None if unknown."""
+
+
+class Photographs(NamedTuple):
+    """Copies of photographs, ready for COLMAP; a copy's name is relative to ``images``."""
+
+    source: Path
+    """Folder of the originals."""
+    images: Path
+    """Folder of the copies."""
+    originals: dict[str, Path]
+    """The original of each copy, relative to ``source``; sorted."""
+    groups: dict[Group, list[str]]
+    """Names of the photographs that share a camera."""
+    masks: Path
+    """Folder of the masks of copies, named as COLMAP does."""
+    masked: frozenset[str]
+    """Names of the photographs that have a mask."""
+
+
+def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
+    """Copy the photographs of a folder upright and shrunk into ``work/images``, and their masks into ``work/masks``.
+
+    Parameters
+    ----------
+    source : Path
+        Folder of photographs.
+    work : Path
+        Folder for the copies.
+    long_side : int
+        A longer side is shrunk to this, pixels.
+
+    Raises
+    ------
+    InputError
+        If there are no photographs, one cannot be read, two have one name, suffix aside, or a mask has another size
+        than its photograph.
+    """
+    images, masks = work / "images", work / MASKS
+    originals: dict[str, Path] = {}
+    groups: dict[Group, list[str]] = {}
+    masked = set()
+    used = set()
+    for file in tqdm(list_images(source), desc="photographs", unit=" images", leave=False, disable=None):
+        relative = file.relative_to(source)
+        name = _name_copy(relative)
+        if name in originals:
+            raise InputError(f"{file}: another photograph is called {name}; give each its own name, suffix aside")
+        originals[name] = relative
+        mask_file = find_mask(source, relative)
+        group, mask = _copy(file, mask_file, images / name, long_side)
+        groups.setdefault(group, []).append(name)
+        if mask is not None:
+            masked.add(name)
+            (masks / f"{name}.png").parent.mkdir(parents=True, exist_ok=True)
+            write_image(masks / f"{name}.png", mask)
+        if mask_file is not None:
+            used.add(mask_file)
+    _warn_of_unused(source, used)
+    return Photographs(source, images, originals, groups, masks, frozenset(masked))
+
+
+def _name_copy(original: Path) -> str:
+    """Return the name of a copy: without spaces, which separate names in COLMAP's lists of pairs."""
+    suffix = ".png" if original.suffix.lower() == ".png" else ".jpg"
+    return re.sub(r"\s", "_", original.with_suffix(suffix).as_posix())
+
+
+def find_mask(source: Path, relative: Path) -> Path | None:
+    """Return the mask file of a photograph, in ``masks/`` in the folder of photographs or beside it; None if none."""
+    stems = (f"{relative}.png", relative.with_suffix(".png"))
+    candidates = [folder / MASKS / stem for folder in (source, source.absolute().parent) for stem in stems]
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> tuple[Group, Bools | None]:
+    """Write the copy of a photograph; return its group, and its mask at the copy's size if it has one."""
+    with open_image(file) as opened:
+        exif = _focal_exif(opened)
+        pixels = pixels_of(ImageOps.exif_transpose(opened))  # [H, W, 3 or 4], upright
+    mask = None if pixels.shape[2] == 3 else pixels[..., 3] >= MASK_THRESHOLD
+    if mask_file is not None:
+        given = read_mask(mask_file)
+        if given.shape != pixels.shape[:2]:
+            raise InputError(
+                f"{mask_file}: the mask is {given.shape[1]}x{given.shape[0]} but its photograph {file.name}, upright,"
+                f" is {pixels.shape[1]}x{pixels.shape[0]}; resize, turn or remove the mask"
+            )
+        mask = given if mask is None else given & mask
+    image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+    image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    image.save(target, exif=exif, **SAVE_OPTIONS["JPEG"])  # PNG ignores these options
+    return _group(image, exif), None if mask is None else resize_mask(mask, *image.size)
+
+
+def _focal_exif(image: Image.Image) -> Image.Exif:
+    """Return the EXIF data of the focal length only; location, time and the orientation, now applied, are left out."""
+    source, focal = image.getexif(), Image.Exif()
+    focal.update({tag: source[tag] for tag in CAMERA_TAGS if tag in source})
+    lens = source.get_ifd(ExifTags.IFD.Exif)
+    focal.get_ifd(ExifTags.IFD.Exif).update({tag: lens[tag] for tag in FOCAL_TAGS if tag in lens})
+    return focal
+
+
+def _group(image: Image.Image, exif: Image.Exif) -> Group:
+    """Return the group of a copy."""
+    lens = exif.get_ifd(ExifTags.IFD.Exif)
+    camera = " ".join(str(exif[tag]).strip(" \0") for tag in CAMERA_TAGS if tag in exif)
+    focal, focal_35 = (_positive(lens.get(tag)) for tag in FOCAL_TAGS)
+    return Group(*image.size, camera, focal, focal_35)
+
+
+def _positive(value: object) -> float | None:
+    """Return a length in the EXIF data, rounded as it is printed; None for nothing, 0 and 0/0, which mean unknown."""
+    try:
+        length = round(float(value), 2)  # type: ignore[arg-type]  # TypeError is caught
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return length if math.isfinite(length) and length > 0 else None
+
+
+def _warn_of_unused(source: Path, used: set[Path]) -> None:
+    """Name the files in ``masks/`` in the folder of photographs that are no photograph's mask."""
+    folder = source / MASKS
+    unused = sorted({file for file in folder.rglob("*.png") if not file.name.startswith(".")} - used)
+    if unused:
+        names = enumerate_names([file.relative_to(folder).as_posix() for file in unused])
+        warnings.warn(
+            one_line(
+                f"{folder}: no photograph belongs to {names}; the mask of 0001.jpg is called 0001.jpg.png or 0001.png"
+            ),
+            InputWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,57 @@
+"""How ``adaptive`` removes veils: Gaussians that stand before sparse points which photographs show.
+
+A photograph shows a sparse point, so nothing opaque lies between. A Gaussian may be blended there all the same, because
+it makes that photograph right where its depth does not matter; any other camera sees it as fog. What it costs cannot be
+seen in the photographs that are trained on, and its opacity gets no gradient that would remove it. So
+:mod:`minisplat_ref.strategy.line_of_sight` says which part of what a Gaussian adds to the rays of sparse points lies
+before these points, and those with a large part are removed. Gaussians on no such ray are not judged.
+"""
+
+import numpy as np
+
+from minisplat_ref.methods.adaptive.numbers import VEIL_VIEWS_MAX
+from minisplat_ref.strategy.line_of_sight import MARGIN, trace_sight_lines
+from minisplat_ref.strategy.ops import keep, n_rows
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit
+from minisplat_ref.types import Floats
+
+
+def remove_veils(
+    state: TrainState, iteration: Iteration, *, max_share_before: float, min_weight_before: float, start: int
+) -> str | None:
+    """Remove Gaussians that the sparse points of the training views contradict.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    max_share_before : float
+        A Gaussian stays if at most this share of its weight on the rays of sparse points is before the points.
+    min_weight_before : float
+        And it stays if its weight before points is less than this in total; one opaque pixel is 1.
+    start : int
+        Nothing is removed until this iteration: Gaussians that cover much at first lie on several surfaces.
+    """
+    if iteration.step <= start:
+        return None
+    before, all_ = weigh_sight_lines(state, iteration)
+    is_veil = (before > max_share_before * all_) & (before >= min_weight_before)
+    if is_veil.any():
+        apply_edit(state, keep(state.gaussians, ~is_veil))
+    return f"{np.count_nonzero(is_veil)} stood before sparse points"
+
+
+def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:
+    """Return the weight of each Gaussian [N] on the rays of sparse points: before the points, and altogether.
+
+    At most :data:`VEIL_VIEWS_MAX` training views are looked at, others each time.
+    """
+    scene, n = iteration.scene, n_rows(state.gaussians)
+    views = [view for view in scene.train_views if view.point_ids is not None and len(view.point_ids)]
+    stride = -(-len(views) // VEIL_VIEWS_MAX)
+    before, all_ = np.zeros(n), np.zeros(n)
+    for view in views[iteration.step // 100 % max(stride, 1) :: max(stride, 1)]:
+        lines = trace_sight_lines(state.model, view, scene.points, iteration.render_settings, MARGIN)
+        all_ += np.bincount(lines.rows, lines.weights, minlength=n)
+        before += np.bincount(lines.rows, lines.weights * lines.is_before, minlength=n)
+    return before, all_

@@ -1,0 +1,154 @@
+"""Plane-sweep stereo (Collins 1996): the depth of each pixel of a small photograph, from its neighbours.
+
+Structure from motion finds points where a photograph has corners; a sweep asks every pixel. For a plane parallel to
+the image at depth d, a neighbour's photograph is warped by the homography of the plane,
+
+    x_n ~ K_n (R + t e_z^T / d) K^-1 x        (R, t): neighbour's camera from the photograph's
+
+and compared over a window W by the zero-mean normalised cross-correlation, which neither a gain nor an offset of the
+brightness changes:
+
+    zncc = (E[a b] - E[a] E[b]) / sqrt(Var[a] Var[b])        E, Var over W
+
+The planes are evenly spaced in 1/d. The score of a plane is the mean over the better half of the neighbours, because
+in the others something may stand before it; the depth is that of the best plane, refined by the parabola through it and
+the planes beside it. A depth counts where the correlation is high, and where a neighbour's own depth agrees
+(:func:`are_confirmed`). Left out: slanted planes, and any smoothness between pixels.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
+from minisplat_ref.types import Bools, Camera, Floats
+
+WINDOW = 5
+"""Pixels, side of W."""
+CORRELATION_MIN = 0.7
+"""Of a depth that counts. Noise alone correlates by 0.2, one over the root of 25 pixels. With 0.8, and with two
+neighbours that confirm, more points are right, and held-out photographs worse (``docs/measured/real_photographs.md``).
+"""
+CONTRAST_MIN = 0.01
+"""Standard deviation of the brightness in W, out of 1, below which a pixel has no depth: 2.5 levels of 255."""
+AGREEMENT = 0.02
+"""Of the depth; a neighbour's depth that differs by less confirms a point."""
+ALL = 1 - 0.5 / WINDOW**2
+"""Share of a window, rounding aside, that only a whole one has."""
+VARIANCE_PRODUCT_MIN = 1e-10
+"""Guards the division where a window is uniform; the contrast rules these pixels out."""
+
+
+class GrayView(NamedTuple):
+    """A small photograph without its colours."""
+
+    camera: Camera
+    gray: Floats
+    """[H, W] float32 in [0, 1]."""
+
+
+class DepthMap(NamedTuple):
+    """The depths of a photograph, as far as they count."""
+
+    depths: Floats
+    """[H, W] camera z, world units; 0 where none counts."""
+    correlations: Floats
+    """[H, W] score of the best plane; 0 where no depth counts."""
+
+
+def sweep_planes(view: GrayView, others: Sequence[GrayView], inverse_depths: Floats) -> DepthMap:
+    """Return the depths at which a photograph looks like its neighbours.
+
+    Parameters
+    ----------
+    view : GrayView
+    others : sequence of GrayView
+        Its neighbours, at least one.
+    inverse_depths : ndarray of shape (D,)
+        1/d of the planes, evenly spaced, ascending; D is at least 3.
+
+    Returns
+    -------
+    DepthMap
+        Without depths at the first and the last plane, beyond which the best one may lie.
+    """
+    height, width = view.gray.shape
+    mean_a, var_a = _moments(view.gray)
+    scores = np.empty((len(others), len(inverse_depths), height, width), np.float32)
+    for k, other in enumerate(others):
+        for i, inverse_depth in enumerate(inverse_depths):
+            b, is_inside = warp(view.camera, other, inverse_depth)
+            mean_b, var_b = _moments(b)
+            covariance = uniform_filter(view.gray * b, WINDOW) - mean_a * mean_b
+            zncc = covariance / np.sqrt(np.maximum(var_a * var_b, VARIANCE_PRODUCT_MIN))
+            has_window = uniform_filter(is_inside.astype(np.float32), WINDOW, mode="constant") > ALL
+            scores[k, i] = np.where(has_window, zncc, -1.0)
+    better_half = max(1, (len(others) + 1) // 2)
+    total = np.sort(scores, axis=0)[-better_half:].mean(axis=0)  # [D, H, W]
+    best = total.argmax(axis=0)  # [H, W]
+    highest = np.take_along_axis(total, best[None], axis=0)[0]
+    is_between = (best > 0) & (best < len(inverse_depths) - 1)
+    offset = _vertex(total, np.clip(best, 1, len(inverse_depths) - 2))
+    inverse = inverse_depths[best] + offset * (inverse_depths[1] - inverse_depths[0])
+    counts = is_between & (highest > CORRELATION_MIN) & (var_a > CONTRAST_MIN**2)
+    return DepthMap(np.where(counts, 1.0 / inverse, 0.0), np.where(counts, highest, 0.0))
+
+
+def warp(camera: Camera, other: GrayView, inverse_depth: float) -> tuple[Floats, Bools]:
+    """Return a neighbour's photograph as the camera would see it on the plane at that depth.
+
+    Returns
+    -------
+    gray : ndarray of shape (H, W)
+    is_inside : ndarray of shape (H, W) of bool
+        Where the neighbour shows the plane.
+    """
+    R = other.camera.cam_from_world_R @ camera.cam_from_world_R.T
+    t = other.camera.cam_from_world_t - R @ camera.cam_from_world_t
+    xs, ys = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    seen = pinhole_rays(xs, ys, camera) @ R.T + t * inverse_depth  # [H, W, 3] neighbour's frame, divided by d
+    is_inside = seen[..., 2] > 0
+    seen[..., 2] = np.where(is_inside, seen[..., 2], 1.0)
+    u, v = pinhole(seen.reshape(-1, 3), other.camera).T.reshape(2, *xs.shape)
+    is_inside &= (u >= 0) & (v >= 0) & (u <= other.camera.width) & (v <= other.camera.height)
+    return map_coordinates(other.gray, [v - 0.5, u - 0.5], order=1, mode="nearest"), is_inside
+
+
+def are_confirmed(view: GrayView, own: DepthMap, others: Sequence[tuple[GrayView, DepthMap]]) -> Bools:
+    """Return where the depth of a photograph is also that of a neighbour, [H, W]."""
+    ys, xs = np.nonzero(own.depths > 0)
+    points = surface_points(view.camera, own.depths, ys, xs)
+    is_confirmed = np.zeros(own.depths.shape, bool)
+    for other, found in others:
+        camera = other.camera
+        seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t  # [P, 3]
+        z = seen[:, 2].copy()
+        seen[:, 2] = np.where(z > 0, z, 1.0)
+        columns, rows = np.floor(pinhole(seen, camera)).T
+        is_inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
+        there = found.depths[np.where(is_inside, rows, 0).astype(int), np.where(is_inside, columns, 0).astype(int)]
+        agrees = is_inside & (there > 0) & (np.abs(there - z) < AGREEMENT * z)
+        is_confirmed[ys[agrees], xs[agrees]] = True
+    return is_confirmed
+
+
+def surface_points(camera: Camera, depths: Floats, rows: np.ndarray, columns: np.ndarray) -> Floats:
+    """Return the points [P, 3], world frame, at the depths of these pixels."""
+    in_camera = pinhole_rays(columns + 0.5, rows + 0.5, camera) * depths[rows, columns][:, None]
+    return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
+
+
+def _moments(gray: Floats) -> tuple[Floats, Floats]:
+    """Return mean and variance over the window around each pixel."""
+    mean = uniform_filter(gray, WINDOW)
+    return mean, np.maximum(uniform_filter(gray * gray, WINDOW) - mean * mean, 0.0)
+
+
+def _vertex(total: Floats, middle: np.ndarray) -> Floats:
+    """Return where the parabola through three neighbouring planes is highest, in planes from the middle one."""
+    left, center, right = (np.take_along_axis(total, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    curvature = left - 2 * center + right
+    is_peak = curvature < 0
+    return np.where(is_peak, 0.5 * (left - right) / np.where(is_peak, curvature, 1.0), 0.0).clip(-0.5, 0.5)

@@ -1,0 +1,91 @@
+"""How many other photographs show what a pixel of a photograph shows.
+
+A pixel whose surface no training photograph shows cannot be rendered rightly, except by luck; its error says nothing
+about a recipe. So that recipes cannot influence what counts, coverage is computed from the sparse points alone: the
+depth of each photograph is interpolated between the points that structure from motion found in it, linearly in 1/z, and
+the surface point of each pixel is projected into the training photographs. One of them shows the point if it lies
+inside the image and, where that is known, not far behind the interpolated surface there.
+
+Left out: occlusion by what no sparse point lies on.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
+from minisplat_ref.types import Camera, Floats, Ints, View
+
+POINTS_MIN = 8
+"""Sparse points that a photograph needs for an interpolated depth."""
+BEHIND = 1.2
+"""A point farther than this times the interpolated depth is behind the surface: twice the tenth by which the depth
+between sparse points is commonly wrong."""
+STRIDE = 4
+"""Pixels; coverage is computed for one pixel in a square of this side and holds for the square."""
+
+
+def count_covering_views(view: View, others: Sequence[View], points: Floats) -> Ints | None:
+    """Return how many of the other views show the surface at each pixel.
+
+    Parameters
+    ----------
+    view : View
+    others : sequence of View
+        Training views.
+    points : ndarray of shape (P, 3)
+        Sparse points, world frame.
+
+    Returns
+    -------
+    ndarray of shape (H, W), int, or None
+        None where the view has too few sparse points, or the scene has no tracks.
+    """
+    camera = view.camera
+    columns, rows = (np.arange(0, side, STRIDE) + 0.5 for side in (camera.width, camera.height))
+    xy = np.stack(np.meshgrid(columns, rows), axis=-1)  # [h, w, 2] pixels
+    depths = interpolate_depths(view, points, xy)
+    if depths is None:
+        return None
+    rays = pinhole_rays(xy[..., 0], xy[..., 1], camera)  # [h, w, 3] camera frame
+    surface = (rays * depths[..., None] - camera.cam_from_world_t) @ camera.cam_from_world_R  # [h, w, 3] world frame
+    counts = np.zeros(xy.shape[:2], int)
+    for other in others:
+        counts += _shows(other, surface, points)
+    return np.repeat(np.repeat(counts, STRIDE, axis=0), STRIDE, axis=1)[: camera.height, : camera.width]
+
+
+def interpolate_depths(view: View, points: Floats, xy: Floats) -> Floats | None:
+    """Return the depth at pixels (x, y) [..., 2] between the sparse points of a view, [...]; None if it has too few."""
+    if view.point_ids is None or len(view.point_ids) < POINTS_MIN:
+        return None
+    uv, z = _project(points[view.point_ids], view.camera)
+    uv, z = uv[z > 0], z[z > 0]
+    if len(z) < POINTS_MIN:
+        return None
+    flat = xy.reshape(-1, 2)
+    inverse = LinearNDInterpolator(uv, 1.0 / z)(flat)
+    outside = np.isnan(inverse)
+    inverse[outside] = NearestNDInterpolator(uv, 1.0 / z)(flat[outside])
+    return (1.0 / inverse).reshape(xy.shape[:-1])
+
+
+def _shows(view: View, surface: Floats, points: Floats) -> Ints:
+    """Return for surface points [h, w, 3] whether a view shows them."""
+    camera = view.camera
+    uv, z = _project(surface.reshape(-1, 3), camera)
+    is_inside = (z > 0) & (uv > 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+    here = np.flatnonzero(is_inside)
+    depths = interpolate_depths(view, points, uv[here]) if len(here) else None
+    if depths is not None:
+        is_inside[here] = z[here] < BEHIND * depths
+    return is_inside.reshape(surface.shape[:2]).astype(int)
+
+
+def _project(points: Floats, camera: Camera) -> tuple[Floats, Floats]:
+    """Return pixels [P, 2] and depths [P] of points [P, 3]; pixels of points behind the camera mean nothing."""
+    seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t  # [P, 3] camera frame
+    z = seen[:, 2].copy()
+    seen[:, 2] = np.where(z > 0, z, 1.0)
+    return pinhole(seen, camera), z

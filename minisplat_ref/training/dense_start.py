@@ -1,0 +1,222 @@
+"""A dense start: surface points between the sparse ones, by stereo on small photographs.
+
+How many points structure from motion finds depends on the features and on the light, not on how much there is to model.
+A training that starts from few of them grows into the air: it ends with few Gaussians, and with fog before cameras. So
+each photograph, made small, is compared with those that share most points with it
+(:mod:`minisplat_ref.strategy.plane_sweep`), and what two of them agree on becomes a point, unless there is one within a
+few pixels already: rich and poor sparse points give a similar start. ``docs/measured/real_photographs.md`` has what
+this is worth.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from tqdm import tqdm
+
+from minisplat_ref.io.images import resize_image, resize_mask
+from minisplat_ref.io.scene import SILENT_SECONDS, rescale_camera
+from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.strategy.line_of_sight import MARGIN
+from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
+
+LONG_SIDE = 144
+"""Pixels, of the small photographs: a sweep takes a quarter of a second, and more planes would not be told apart."""
+N_PLANES = 64
+"""Depths that are compared. No reason recorded."""
+N_NEIGHBOURS = 4
+"""Photographs that each is compared with, at most. No reason recorded."""
+VIEWS_MAX = 48
+"""Photographs that are compared, evenly spread, at most: some twelve seconds."""
+SPACING = 3.0
+"""Pixels of the small photographs: nearer than this to another point no point is added."""
+NEAR_A_RAY = 1.0
+"""Pixels of the small photographs: a point is on the ray to a sparse point that is not farther from it."""
+ANGLE_GOOD, ANGLE_MAX = 6.0, 40.0
+"""Degrees between the rays to a point: from the first on depth is well determined, beyond the second windows look
+different."""
+POINTS_MIN = 8
+"""Sparse points of a photograph that say how deep it is; with fewer, all that lie in its image count."""
+DEPTH_MARGINS = (0.7, 2.0)
+"""Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept."""
+EXTENT_DEPTHS = (0.3, 20.0)
+"""In units of the scene's extent: depths that are swept where no point says how deep the scene is."""
+
+
+class _Small(NamedTuple):
+    gray_view: GrayView
+    rgb: NDArray[np.uint8]  # [h, w, 3]
+    mask: Bools | None  # [h, w]
+    inverse_depths: Floats  # [D]
+
+
+def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the sparse points of a scene, and points that stereo has found between them.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its training photographs are compared.
+
+    Returns
+    -------
+    points : ndarray of shape (P, 3)
+        World frame; the sparse points first.
+    colors : ndarray of shape (P, 3), uint8
+    """
+    views = scene.train_views[:: -(-len(scene.train_views) // VIEWS_MAX)]
+    smalls = [_shrink(view.load(), scene) for view in views]
+    neighbours = choose_neighbours(views, scene.points)
+    jobs = list(zip(smalls, neighbours, strict=True))
+    progress = tqdm(jobs, desc="stereo", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
+    maps = [_sweep(small, [smalls[k].gray_view for k in near]) for small, near in progress]
+    points, colors = scene.points, scene.point_colors
+    for small, own, near in zip(smalls, maps, neighbours, strict=True):
+        is_confirmed = are_confirmed(small.gray_view, own, [(smalls[k].gray_view, maps[k]) for k in near])
+        rows, columns = np.nonzero(is_confirmed)
+        order = np.argsort(-own.correlations[rows, columns], kind="stable")
+        rows, columns = rows[order], columns[order]
+        camera = small.gray_view.camera
+        found = surface_points(camera, own.depths, rows, columns)
+        chosen = choose_spread(found, SPACING * own.depths[rows, columns] / camera.fx, points)
+        points = np.concatenate([points, found[chosen]])
+        colors = np.concatenate([colors, small.rgb[rows[chosen], columns[chosen]]])
+    stays = ~stand_before(points, views, scene.points)
+    stays[: len(scene.points)] = True
+    return points[stays], colors[stays]
+
+
+def choose_neighbours(views: Sequence[View], points: Floats) -> list[list[int]]:
+    """Return for each view the others, best first, that share most points with it at a good angle.
+
+    A shared point counts in proportion to the angle between its rays up to :data:`ANGLE_GOOD`, and not at all beyond
+    :data:`ANGLE_MAX`. Where the scene has no points, those count whose cameras look in similar directions, the nearest
+    first.
+    """
+    seen = [_seen_ids(view, points) for view in views]
+    centers = np.array([view.camera.center for view in views])
+    axes = np.array([view.camera.cam_from_world_R[2] for view in views])  # [V, 3] viewing directions, world frame
+    chosen = []
+    for i, own in enumerate(seen):
+        scores = np.zeros(len(views))
+        for k, ids in enumerate(seen):
+            if k == i:
+                continue
+            shared = points[np.intersect1d(own, ids, assume_unique=True)]
+            if len(points):
+                angles = _angles(shared - centers[i], shared - centers[k])
+                scores[k] = np.where(angles > ANGLE_MAX, 0.0, np.minimum(angles / ANGLE_GOOD, 1.0)).sum()
+            elif axes[i] @ axes[k] > np.cos(np.radians(ANGLE_MAX)):
+                distance = np.linalg.norm(centers[i] - centers[k])
+                scores[k] = 1.0 / distance if distance > 0 else 0.0
+        best = np.argsort(-scores, kind="stable")[:N_NEIGHBOURS]
+        chosen.append([int(k) for k in best if scores[k] > 0])
+    return chosen
+
+
+def stand_before(points: Floats, views: Sequence[View], sparse_points: Floats) -> Bools:
+    """Return which points [P] stand before a sparse point that a view shows beside them, within a small pixel.
+
+    A photograph that shows a sparse point says that the ray up to it is free
+    (:mod:`minisplat_ref.strategy.line_of_sight`); stereo that is deceived by a repeated pattern puts points there.
+    """
+    found = np.zeros(len(points), bool)
+    for view in views:
+        if view.point_ids is None or not len(view.point_ids):
+            continue
+        camera = view.camera
+        radius = NEAR_A_RAY * max(1.0, max(camera.width, camera.height) / LONG_SIDE)
+        _, known_xy, known_z = _project(sparse_points[view.point_ids], camera)
+        rows, xy, z = _project(points, camera)
+        if len(known_z) and len(z):
+            distances, nearest = cKDTree(known_xy).query(xy, distance_upper_bound=radius)
+            is_near = np.isfinite(distances)
+            found[rows[is_near]] |= z[is_near] < (1.0 - MARGIN) * known_z[nearest[is_near]]
+    return found
+
+
+def choose_spread(points: Floats, spacings: Floats, others: Floats) -> Ints:
+    """Return which points stay so that each keeps its distance from the others and from those before it.
+
+    Parameters
+    ----------
+    points : ndarray of shape (P, 3)
+        Best first.
+    spacings : ndarray of shape (P,)
+        Least distance of each.
+    others : ndarray of shape (Q, 3)
+        Points that are there already.
+
+    Returns
+    -------
+    ndarray of shape (R,) of int
+        Rows, ascending.
+    """
+    free = np.ones(len(points), bool)
+    if len(others) and len(points):
+        free = cKDTree(others).query(points)[0] > spacings
+    rows = np.flatnonzero(free)
+    if not len(rows):
+        return rows
+    near = cKDTree(points[rows]).query_ball_point(points[rows], spacings[rows], return_sorted=True)
+    stays = np.ones(len(rows), bool)
+    for i, close in enumerate(near):
+        if stays[i]:
+            stays[[k for k in close if k > i]] = False
+    return rows[stays]
+
+
+def _shrink(view: View, scene: Scene) -> _Small:
+    """Return a photograph made small, with the depths to sweep."""
+    camera = view.camera
+    factor = min(1.0, LONG_SIDE / max(camera.width, camera.height))
+    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
+    rgb = resize_image(view.image, width, height)
+    mask = None if view.mask is None else resize_mask(view.mask, width, height)
+    gray = rgb.mean(axis=2, dtype=np.float32) / np.float32(255.0)
+    near, far = _depth_range(view, scene)
+    return _Small(
+        GrayView(rescale_camera(camera, width, height), gray), rgb, mask, np.linspace(1 / far, 1 / near, N_PLANES)
+    )
+
+
+def _depth_range(view: View, scene: Scene) -> tuple[float, float]:
+    """Return the nearest and the farthest depth at which a view may show something, world units."""
+    _, _, depths = _project(scene.points[_seen_ids(view, scene.points)], view.camera)
+    if not len(depths):
+        return EXTENT_DEPTHS[0] * scene.extent, EXTENT_DEPTHS[1] * scene.extent
+    near, far = np.percentile(depths, (1, 99)) * DEPTH_MARGINS
+    return float(near), float(far)
+
+
+def _seen_ids(view: View, points: Floats) -> Ints:
+    """Return which sparse points a view shows: those of its track, or all in its image."""
+    if view.point_ids is not None and len(view.point_ids) >= POINTS_MIN:
+        return view.point_ids
+    return _project(points, view.camera)[0]
+
+
+def _project(points: Floats, camera: Camera) -> tuple[Ints, Floats, Floats]:
+    """Return rows, pixels [Q, 2] and depths [Q] of the points that lie in the image of a camera."""
+    seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    rows = np.flatnonzero(seen[:, 2] > 0)
+    xy = pinhole(seen[rows], camera)
+    is_inside = (xy >= 0).all(axis=1) & (xy < (camera.width, camera.height)).all(axis=1)
+    return rows[is_inside], xy[is_inside], seen[rows[is_inside], 2]
+
+
+def _sweep(small: _Small, others: Sequence[GrayView]) -> DepthMap:
+    """Return the depths of a small photograph, without those of masked pixels."""
+    if not others:
+        nothing = np.zeros(small.gray_view.gray.shape)
+        return DepthMap(nothing, nothing)
+    found = sweep_planes(small.gray_view, others, small.inverse_depths)
+    return found if small.mask is None else DepthMap(*(np.where(small.mask, field, 0.0) for field in found))
+
+
+def _angles(a: Floats, b: Floats) -> Floats:
+    """Return the angles between vectors [P, 3], degrees."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))

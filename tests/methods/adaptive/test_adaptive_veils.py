@@ -1,0 +1,103 @@
+"""Veils: Gaussians before the sparse points of a photograph go, and nothing else does."""
+
+import numpy as np
+import pytest
+
+from minisplat_ref.methods.adaptive import veils
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
+from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.schedule import does, settings_of
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Gaussians, Scene, view_from
+from scenes import make_camera
+
+CAMERA = make_camera(33, 33, fx=30.0, fy=30.0)
+POINTS = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]])
+SETTINGS = {"max_share_before": 0.5, "min_weight_before": 0.1, "start": 500}
+
+
+def gaussians(means, opacities, scale=0.1):
+    o, n = np.array(opacities, np.float64), len(means)
+    return Gaussians(
+        np.array(means, np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.full((n, 3), np.log(scale), np.float32),
+        np.log(o / (1 - o)).astype(np.float32),
+        np.zeros((n, 3), np.float32),
+        np.zeros((n, 0, 3), np.float32),
+    )
+
+
+def setting(model, n_views=1, step=600):
+    views = tuple(
+        view_from(CAMERA)._replace(point_ids=np.array([0, 1]), name=str(i), view_id=i) for i in range(n_views)
+    )
+    scene = Scene("hand", views, (), POINTS, np.zeros((2, 3), np.uint8), np.zeros(3), 1.0)
+    state = TrainState(
+        model, zero_moments(model), step=step, view_order=[], rng=np.random.default_rng(0), stats={}, shared={},
+        shared_adam=zero_moments({}),
+    )  # fmt: skip
+    return state, Iteration(scene, views[0], None, None, None, RenderSettings(), step=step)
+
+
+def test_a_veil_goes_and_surfaces_stay():
+    """On the rays of two points: a veil before the first, surfaces at both, and a Gaussian on no ray."""
+    model = gaussians([[0, 0, 2], [0, 0, 5], [1, 0, 5], [-1, 0, 2]], [0.4, 0.9, 0.9, 0.9])
+    state, iteration = setting(model)
+    before, all_ = veils.weigh_sight_lines(state, iteration)
+    np.testing.assert_allclose(before, [0.4, 0, 0, 0], rtol=1e-5)
+    np.testing.assert_allclose(all_, [0.4, 0.54, 0.9, 0], rtol=1e-4)
+    note = veils.remove_veils(state, iteration, **SETTINGS)
+    assert note == "1 stood before sparse points"
+    np.testing.assert_array_equal(state.gaussians.means, model.means[1:])
+    assert len(state.adam.first.means) == 3
+
+
+@pytest.mark.parametrize(
+    ("opacity", "changes"),
+    [(0.4, {"start": 600}), (0.09, {}), (0.4, {"min_weight_before": 0.5}), (0.4, {"max_share_before": 1.0})],
+)
+def test_what_stays(opacity, changes):
+    """Before its time; below the least weight, the default one or another; and if all shares are allowed."""
+    state, iteration = setting(gaussians([[0, 0, 2], [0, 0, 5]], [opacity, 0.9]))
+    veils.remove_veils(state, iteration, **(SETTINGS | changes))
+    assert len(state.gaussians.means) == 2
+
+
+def test_a_surface_that_covers_two_rays_is_weighed_on_both():
+    """A Gaussian at 4 stands before the point at 5 and behind the one at 3.5: half of its weight is before."""
+    model = gaussians([[0.4, 0, 4.0]], [0.8], scale=2.0)
+    points = np.array([[0.0, 0, 5], [0.56, 0, 3.5]])  # both 0.8 from the axis of the Gaussian's image, one on each side
+    state, iteration = setting(model)
+    iteration = iteration._replace(scene=iteration.scene._replace(points=points))
+    before, all_ = veils.weigh_sight_lines(state, iteration)
+    assert before[0] == pytest.approx(all_[0] / 2, rel=0.02)
+    veils.remove_veils(state, iteration, **(SETTINGS | {"max_share_before": 0.55}))
+    assert len(state.gaussians.means) == 1
+    veils.remove_veils(state, iteration, **(SETTINGS | {"max_share_before": 0.45}))
+    assert len(state.gaussians.means) == 0
+
+
+def test_views_without_tracks_say_nothing():
+    state, iteration = setting(gaussians([[0, 0, 2]], [0.9]))
+    blind = tuple(view._replace(point_ids=None) for view in iteration.scene.train_views)
+    veils.remove_veils(state, iteration._replace(scene=iteration.scene._replace(train_views=blind)), **SETTINGS)
+    assert len(state.gaussians.means) == 1
+
+
+def test_of_many_views_others_are_looked_at_each_time(monkeypatch):
+    monkeypatch.setattr(veils, "VEIL_VIEWS_MAX", 2)
+    seen = []
+    real = veils.trace_sight_lines
+    monkeypatch.setattr(veils, "trace_sight_lines", lambda m, view, *a: seen.append(view.name) or real(m, view, *a))
+    for step in (600, 700, 800):
+        veils.weigh_sight_lines(*setting(gaussians([[0, 0, 2]], [0.4]), n_views=5, step=step))
+    assert seen == ["0", "3", "1", "4", "2"]  # every third, from 600 / 100 modulo 3 on
+
+
+def test_adaptive_does_it_every_hundred_iterations():
+    [event] = [event for event in ADAPTIVE.events if does(event, veils.remove_veils)]
+    assert [step for step in range(1, 401) if event.is_due(step)] == [200, 300, 400]
+    settings = settings_of(ADAPTIVE)
+    assert {name: settings[name] for name in SETTINGS} == SETTINGS
