@@ -76,16 +76,26 @@ def _in_another_order(folder: Path) -> None:
 
 
 def _colored(folder: Path, kind: str) -> None:
-    """Colours as red, green, blue, as bytes, 16 bits or floats."""
+    """Colours as red, green, blue, as bytes, longer integers or floats."""
     columns = _columns(folder, 0)
     dc = np.stack([columns.pop(f"f_dc_{c}") for c in range(3)], axis=1)
     levels = np.rint(255 * (0.5 + 0.28209479177387814 * dc))
-    values = {"u1": levels, "u2": 257 * levels, "f4": levels / 255}[kind].astype(kind)
+    values = (levels / 255 if kind == "f4" else levels).astype(kind)
     write_vertices(folder / "other.ply", columns | dict(zip(("red", "green", "blue"), values.T, strict=True)))
     said = command("info", folder / "other.ply")
     assert said.code == 0 and any("red, green, blue" in warning for warning in said.warnings), said.err
     shown = (levels / 255 - 0.5) / 0.28209479177387814
     _assert_same(folder / "other.ply", gaussians(0)._replace(sh_dc=shown.astype(np.float32)))
+
+
+def _wrong_colors(folder: Path) -> None:
+    columns = _columns(folder, 0)
+    for c, color in enumerate(("red", "green", "blue")):
+        del columns[f"f_dc_{c}"]
+        columns[color] = np.linspace(0, 65535, N).astype(np.uint16)
+    write_vertices(folder / "other.ply", columns)
+    line = refused("info", folder / "other.ply", names="other.ply")
+    assert "red goes from 0 to 65535" in line and "uchar" in line
 
 
 def _flat(folder: Path) -> None:
@@ -225,7 +235,8 @@ RENAMED: dict[str, dict[str, str]] = {
 CASES: dict[str, Callable[[Path], None]] = {
     **{what: partial(_renamed, names=names) for what, names in RENAMED.items()},
     "another order": _in_another_order,
-    **{f"colours of type {kind}": partial(_colored, kind=kind) for kind in ("u1", "u2", "f4")},
+    **{f"colours of type {kind}": partial(_colored, kind=kind) for kind in ("u1", "i4", "f4")},
+    "colours of 16 bits": _wrong_colors,
     "two scales": _flat,
     "opacity of infinity": partial(_infinite, name="opacity", value=np.inf, taken=16.0),
     "opacity of minus infinity": partial(_infinite, name="opacity", value=-np.inf, taken=-16.0),

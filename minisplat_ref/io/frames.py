@@ -4,8 +4,9 @@ The renderer has constants in world units: Gaussians nearer than 0.01 or 0.2 are
 3e-4. COLMAP's scenes are a few units large, and there these constants do no harm; in a scene of a few millimetres, in
 metres, they cull everything. Parameters are float32: the last digit of a coordinate in UTM, at 5,000 km from the
 origin, is half a metre. Such a scene is moved to the origin and scaled to a few units while it is in memory; all files
-keep the coordinates of the scene. The unit is a power of two and the origin a whole number of units, so that the way
-back is exact. Scenes of ordinary size and place keep their frame, and their bytes.
+keep the coordinates of the scene. The unit is a power of two and the origin a whole number of units, so that nothing is
+rounded on the way but float64's last digit, a nanometre in UTM. Scenes of ordinary size and place keep their frame, and
+their bytes.
 """
 
 import math
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from minisplat_ref.io.json_file import as_array, as_number
 from minisplat_ref.types import FILE_FRAME, Camera, Floats, Frame, Scene
 
-EXTENT_MIN, EXTENT_MAX = 1.0, 1e4  # world units of ordinary scenes: 100 or 5 times the near planes, at least
+EXTENT_MIN, EXTENT_MAX = 0.5, 1e4  # world units of ordinary scenes: 50 or 2.5 times the near planes, at least
 EXTENT = 4.0  # what others are scaled to, within a factor of the square root of 2
 # Extents from the origin to the cameras, in ordinary scenes. float32 has 24 bits: at 100 extents it resolves 6e-6 of
 # an extent, a hundredth of a pixel of a photograph of 1,000.

@@ -14,6 +14,7 @@ import re
 import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote
 
 from minisplat_ref.errors import InputError
 
@@ -33,12 +34,13 @@ def is_file(path: Path) -> bool:
 def spelled_on_disk(folder: Path, name: str) -> str:
     """Return the name by which a file is there: as given, or as another system would take it for the same.
 
-    Windows and macOS take ``a.JPG`` for ``a.jpg``, Windows writes backslashes, and macOS may decompose accents.
+    Windows and macOS take ``a.JPG`` for ``a.jpg``, Windows writes backslashes, macOS may decompose accents, and some
+    exporters write names as in addresses, ``a%20b.jpg``.
     """
     suffix = Path(name).suffix
     stem = name[: len(name) - len(suffix)]
     forms = [name, stem + suffix.lower(), stem + suffix.upper(), name.replace("\\", "/")]
-    forms += [unicodedata.normalize(form, name) for form in ("NFC", "NFD")]
+    forms += [unquote(name), *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
     return next((form for form in forms if ".." not in Path(form).parts and is_file(folder / form)), name)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.errors import InputError, InputWarning, one_line
 
 STEMS = {
     **{stem: "" for stem in ("pos", "position", "positions", "mean", "means", "xyz", "center", "centre")},
@@ -81,6 +81,11 @@ def as_usual(path: str | Path, columns: Mapping[str, NDArray]) -> dict[str, NDAr
         The file, for messages.
     columns : mapping of str to ndarray of shape (P,)
         As the file has them. Those of other files than of Gaussians stay as they are.
+
+    Raises
+    ------
+    InputError
+        A colour is out of range.
     """
     names = renamed(columns)
     usual = {names.get(name, name): column for name, column in columns.items()}
@@ -90,7 +95,7 @@ def as_usual(path: str | Path, columns: Mapping[str, NDArray]) -> dict[str, NDAr
     colors = {name.casefold(): name for name in columns}
     if not any(name in usual for name in DC) and all(name in colors for name in RGB):
         for dc, color in zip(DC, RGB, strict=True):
-            usual[dc] = _coefficients(usual[colors[color]])
+            usual[dc] = _coefficients(path, color, usual[colors[color]])
         notes.append("its colours are red, green, blue: the same from all sides")
     if "scale_2" not in usual:
         smaller = np.minimum(usual["scale_0"], usual["scale_1"])
@@ -102,9 +107,15 @@ def as_usual(path: str | Path, columns: Mapping[str, NDArray]) -> dict[str, NDAr
     return usual
 
 
-def _coefficients(values: NDArray) -> NDArray[np.float32]:
-    """Return the harmonics' coefficients of degree 0 of colours, integers to 255 or floats to 1."""
-    white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
+def _coefficients(path: str | Path, name: str, values: NDArray) -> NDArray[np.float32]:
+    """Return the harmonics' coefficients of degree 0 of colours, integers from 0 to 255 or floats from 0 to 1."""
+    white = 1.0 if values.dtype.kind == "f" else 255.0
+    low, high = values.min(initial=0), values.max(initial=0)
+    if not (low >= 0 and high <= white):
+        raise InputError(
+            f"{path}: {name} goes from {low:g} to {high:g}; colours are integers from 0 to 255 or floats from 0 to 1:"
+            " export them as uchar"
+        )
     return ((values / white - 0.5) / SH_C0).astype(np.float32)
 
 
