@@ -27,16 +27,16 @@ from minisplat_ref.types import Bools, Camera, Floats
 
 WINDOW = 5
 """Pixels, side of W."""
+HALF = WINDOW // 2
+"""Pixels beside the middle of a window."""
 CORRELATION_MIN = 0.7
 """Of a depth that counts. Noise alone correlates by 0.2, one over the root of 25 pixels. With 0.8, and with two
-neighbours that confirm, more points are right, and held-out photographs worse (``docs/measured/real_photographs.md``).
+neighbours that confirm, more points are right, and held-out photographs worse (``docs/measured/adaptive.md``).
 """
 CONTRAST_MIN = 0.01
 """Standard deviation of the brightness in W, out of 1, below which a pixel has no depth: 2.5 levels of 255."""
 AGREEMENT = 0.02
 """Of the depth; a neighbour's depth that differs by less confirms a point."""
-ALL = 1 - 0.5 / WINDOW**2
-"""Share of a window, rounding aside, that only a whole one has."""
 VARIANCE_PRODUCT_MIN = 1e-10
 """Guards the division where a window is uniform; the contrast rules these pixels out."""
 
@@ -78,13 +78,13 @@ def sweep_planes(view: GrayView, others: Sequence[GrayView], inverse_depths: Flo
     mean_a, var_a = _moments(view.gray)
     scores = np.empty((len(others), len(inverse_depths), height, width), np.float32)
     for k, other in enumerate(others):
+        rays = rays_between(view.camera, other.camera)
         for i, inverse_depth in enumerate(inverse_depths):
-            b, is_inside = warp(view.camera, other, inverse_depth)
+            b, is_inside = warp(rays, other, inverse_depth)
             mean_b, var_b = _moments(b)
             covariance = uniform_filter(view.gray * b, WINDOW) - mean_a * mean_b
             zncc = covariance / np.sqrt(np.maximum(var_a * var_b, VARIANCE_PRODUCT_MIN))
-            has_window = uniform_filter(is_inside.astype(np.float32), WINDOW, mode="constant") > ALL
-            scores[k, i] = np.where(has_window, zncc, -1.0)
+            scores[k, i] = np.where(is_inside, zncc, -1.0)
     better_half = max(1, (len(others) + 1) // 2)
     total = np.sort(scores, axis=0)[-better_half:].mean(axis=0)  # [D, H, W]
     best = total.argmax(axis=0)  # [H, W]
@@ -93,27 +93,54 @@ def sweep_planes(view: GrayView, others: Sequence[GrayView], inverse_depths: Flo
     offset = _vertex(total, np.clip(best, 1, len(inverse_depths) - 2))
     inverse = inverse_depths[best] + offset * (inverse_depths[1] - inverse_depths[0])
     counts = is_between & (highest > CORRELATION_MIN) & (var_a > CONTRAST_MIN**2)
+    counts[:HALF], counts[-HALF:], counts[:, :HALF], counts[:, -HALF:] = False, False, False, False  # no whole window
     return DepthMap(np.where(counts, 1.0 / inverse, 0.0), np.where(counts, highest, 0.0))
 
 
-def warp(camera: Camera, other: GrayView, inverse_depth: float) -> tuple[Floats, Bools]:
+class PlaneRays(NamedTuple):
+    """The rays of a camera's pixels in the frame of another: a plane at depth d is met at ``directions + t / d``."""
+
+    directions: Floats
+    """[3, H, W] float32, R times the ray with z = 1."""
+    t: Floats
+    """[3] float32, world units."""
+
+
+def rays_between(camera: Camera, other: Camera) -> PlaneRays:
+    """Return the rays of a camera in the frame of another."""
+    R = other.cam_from_world_R @ camera.cam_from_world_R.T
+    t = other.cam_from_world_t - R @ camera.cam_from_world_t
+    xs, ys = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    directions = np.moveaxis(pinhole_rays(xs, ys, camera) @ R.T, -1, 0)
+    return PlaneRays(np.ascontiguousarray(directions, np.float32), t.astype(np.float32))
+
+
+def warp(rays: PlaneRays, other: GrayView, inverse_depth: float) -> tuple[Floats, Bools]:
     """Return a neighbour's photograph as the camera would see it on the plane at that depth.
+
+    Parameters
+    ----------
+    rays : PlaneRays
+        Of the camera, in the neighbour's frame.
+    other : GrayView
+        The neighbour.
+    inverse_depth : float
 
     Returns
     -------
     gray : ndarray of shape (H, W)
+        float32.
     is_inside : ndarray of shape (H, W) of bool
-        Where the neighbour shows the plane.
+        Where the neighbour shows the plane, and half a window around it.
     """
-    R = other.camera.cam_from_world_R @ camera.cam_from_world_R.T
-    t = other.camera.cam_from_world_t - R @ camera.cam_from_world_t
-    xs, ys = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    seen = pinhole_rays(xs, ys, camera) @ R.T + t * inverse_depth  # [H, W, 3] neighbour's frame, divided by d
-    is_inside = seen[..., 2] > 0
-    seen[..., 2] = np.where(is_inside, seen[..., 2], 1.0)
-    u, v = pinhole(seen.reshape(-1, 3), other.camera).T.reshape(2, *xs.shape)
-    is_inside &= (u >= 0) & (v >= 0) & (u <= other.camera.width) & (v <= other.camera.height)
-    return map_coordinates(other.gray, [v - 0.5, u - 0.5], order=1, mode="nearest"), is_inside
+    camera = other.camera
+    x, y, z = (d + np.float32(shift * inverse_depth) for d, shift in zip(rays.directions, rays.t, strict=True))
+    is_inside = z > 0
+    z = np.where(is_inside, z, np.float32(1))
+    u, v = np.float32(camera.fx) * x / z + np.float32(camera.cx), np.float32(camera.fy) * y / z + np.float32(camera.cy)
+    is_inside &= (u >= HALF) & (v >= HALF) & (u <= camera.width - HALF) & (v <= camera.height - HALF)
+    half = np.float32(0.5)
+    return map_coordinates(other.gray, [v - half, u - half], order=1, mode="nearest"), is_inside
 
 
 def are_confirmed(view: GrayView, own: DepthMap, others: Sequence[tuple[GrayView, DepthMap]]) -> Bools:

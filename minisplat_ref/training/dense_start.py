@@ -4,7 +4,7 @@ How many points structure from motion finds depends on the features and on the l
 A training that starts from few of them grows into the air: it ends with few Gaussians, and with fog before cameras. So
 each photograph, made small, is compared with those that share most points with it
 (:mod:`minisplat_ref.strategy.plane_sweep`), and what two of them agree on becomes a point, unless there is one within a
-few pixels already: rich and poor sparse points give a similar start. ``docs/measured/real_photographs.md`` has what
+few pixels already: rich and poor sparse points give a similar start. ``docs/measured/adaptive.md`` has what
 this is worth.
 """
 
@@ -24,13 +24,13 @@ from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
 
 LONG_SIDE = 144
-"""Pixels, of the small photographs: a sweep takes a quarter of a second, and more planes would not be told apart."""
-N_PLANES = 64
+"""Pixels, of the small photographs: a sweep takes a tenth of a second or two."""
+N_PLANES = 48
 """Depths that are compared. No reason recorded."""
 N_NEIGHBOURS = 4
 """Photographs that each is compared with, at most. No reason recorded."""
-VIEWS_MAX = 48
-"""Photographs that are compared, evenly spread, at most: some twelve seconds."""
+VIEWS_MAX = 32
+"""Photographs that are compared, evenly spread, at most, so that the start takes a few seconds."""
 SPACING = 3.0
 """Pixels of the small photographs: nearer than this to another point no point is added."""
 NEAR_A_RAY = 1.0

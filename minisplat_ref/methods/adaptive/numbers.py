@@ -118,8 +118,9 @@ VEIL_WEIGHT_MIN = 0.1
 """Weight before points, in opaque pixels, below which a Gaussian is left alone: a tenth of one pixel."""
 VEIL_START = 500
 """Iteration before which nothing is removed: until then Gaussians are large and lie on several surfaces."""
-VEIL_VIEWS_MAX = 24
-"""Training views that are looked at each time, at most, so that this takes a small part of the time."""
+VEIL_VIEWS_MAX, VEIL_RAYS_MAX = 8, 256
+"""Training views that are looked at each time, and rays of each, at most, so that this takes a small part of the time:
+a third of a second, every 100 iterations."""
 
 # --- pruning ---
 

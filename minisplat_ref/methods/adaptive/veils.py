@@ -7,9 +7,11 @@ seen in the photographs that are trained on, and its opacity gets no gradient th
 before these points, and those with a large part are removed. Gaussians on no such ray are not judged.
 """
 
+from typing import Any
+
 import numpy as np
 
-from minisplat_ref.methods.adaptive.numbers import VEIL_VIEWS_MAX
+from minisplat_ref.methods.adaptive.numbers import PERIOD, VEIL_RAYS_MAX, VEIL_VIEWS_MAX
 from minisplat_ref.strategy.line_of_sight import MARGIN, trace_sight_lines
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
@@ -44,14 +46,21 @@ def remove_veils(
 def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:
     """Return the weight of each Gaussian [N] on the rays of sparse points: before the points, and altogether.
 
-    At most :data:`VEIL_VIEWS_MAX` training views are looked at, others each time.
+    It looks at :data:`VEIL_VIEWS_MAX` training views and :data:`VEIL_RAYS_MAX` rays of each at most, others each time.
     """
-    scene, n = iteration.scene, n_rows(state.gaussians)
+    scene, n, turn = iteration.scene, n_rows(state.gaussians), iteration.step // PERIOD
     views = [view for view in scene.train_views if view.point_ids is not None and len(view.point_ids)]
-    stride = -(-len(views) // VEIL_VIEWS_MAX)
     before, all_ = np.zeros(n), np.zeros(n)
-    for view in views[iteration.step // 100 % max(stride, 1) :: max(stride, 1)]:
-        lines = trace_sight_lines(state.model, view, scene.points, iteration.render_settings, MARGIN)
+    for view in _some(views, VEIL_VIEWS_MAX, turn):
+        assert view.point_ids is not None
+        some_points = view._replace(point_ids=_some(view.point_ids, VEIL_RAYS_MAX, turn))
+        lines = trace_sight_lines(state.model, some_points, scene.points, iteration.render_settings, MARGIN)
         all_ += np.bincount(lines.rows, lines.weights, minlength=n)
         before += np.bincount(lines.rows, lines.weights * lines.is_before, minlength=n)
     return before, all_
+
+
+def _some(items: Any, most: int, turn: int) -> Any:
+    """Return every n-th of the items, so that there are at most so many; each turn begins with another."""
+    stride = max(1, -(-len(items) // most))
+    return items[turn % stride :: stride]
