@@ -93,7 +93,7 @@ panels["psnr"].legend()
 plt.show()
 
 # %% [markdown]
-# The bare room ends with two thirds of the Gaussians, at a PSNR that is 6 dB higher. It has grown to half as many as
+# The bare room ends with six tenths of the Gaussians, at a PSNR that is 6 dB higher. It has grown to half as many as
 # the other, because on bare walls gradients soon are small; then the prune takes what the photographs would hardly miss
 # from both, and more of it from the room, whose growth has gone on to the limit. This is the log of the decisions, as
 # the state keeps it:
@@ -108,8 +108,8 @@ for name, log in logs.items():
 
 # %% [markdown]
 # Every hundred iterations `grow` halves the Gaussians whose screen gradient reaches a threshold, at most a fifth of
-# all. In the room more than a fifth is above it until the end; in the bare room it is always less, and from iteration
-# 500 on less at each event. In small photographs the limit is what counts, see `docs/measured/adaptive.md`.
+# all. In the room more than a fifth is above it at first, and fewer later; in the bare room it is always less. In small
+# photographs the limit is what counts, see `docs/measured/adaptive.md`.
 #
 # | file | what it holds |
 # |---|---|
@@ -274,10 +274,10 @@ print(state.pace.decisions[0].why)
 print(", ".join(f"{name}: {value:.2f} of the true gain" for name, value in slopes.items()))
 
 # %% [markdown]
-# The measured gains follow the true ones only loosely (correlation 0.38), with far too small a spread, but that is
+# The measured gains follow the true ones only loosely, with far too small a spread, but that is
 # enough to detect them. With so few small photographs the scene has probably explained much of the gains itself, by
 # colours that depend on the direction and by Gaussians that only some cameras see. The exposures go on learning, and
-# soon follow better (0.70). The undisturbed scene has no such decision in its log.
+# soon follow better. The undisturbed scene has no such decision in its log.
 #
 # ## Play
 #

@@ -33,6 +33,8 @@ VIEWS_MAX = 32
 """Photographs that are compared, evenly spread, at most, so that the start takes a few seconds."""
 SPACING = 3.0
 """Pixels of the small photographs: nearer than this to another point no point is added."""
+COMPANY, REACH = 3, 4.0
+"""Other points, within so many spacings, without which a point is a mistake. No reason recorded for three and four."""
 NEAR_A_RAY = 1.0
 """Pixels of the small photographs: a point is on the ray to a sparse point that is not farther from it."""
 ANGLE_GOOD, ANGLE_MAX = 6.0, 40.0
@@ -73,7 +75,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
     jobs = list(zip(smalls, neighbours, strict=True))
     progress = tqdm(jobs, desc="stereo", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
     maps = [_sweep(small, [smalls[k].gray_view for k in near]) for small, near in progress]
-    points, colors = scene.points, scene.point_colors
+    points, colors, spacings = scene.points, scene.point_colors, np.full(len(scene.points), np.inf)
     for small, own, near in zip(smalls, maps, neighbours, strict=True):
         is_confirmed = are_confirmed(small.gray_view, own, [(smalls[k].gray_view, maps[k]) for k in near])
         rows, columns = np.nonzero(is_confirmed)
@@ -81,10 +83,11 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
         rows, columns = rows[order], columns[order]
         camera = small.gray_view.camera
         found = surface_points(camera, own.depths, rows, columns)
-        chosen = choose_spread(found, SPACING * own.depths[rows, columns] / camera.fx, points)
-        points = np.concatenate([points, found[chosen]])
+        wide = SPACING * own.depths[rows, columns] / camera.fx
+        chosen = choose_spread(found, wide, points)
+        points, spacings = np.concatenate([points, found[chosen]]), np.concatenate([spacings, wide[chosen]])
         colors = np.concatenate([colors, small.rgb[rows[chosen], columns[chosen]]])
-    stays = ~stand_before(points, views, scene.points)
+    stays = ~stand_before(points, views, scene.points) & have_company(points, spacings)
     stays[: len(scene.points)] = True
     return points[stays], colors[stays]
 
@@ -136,6 +139,17 @@ def stand_before(points: Floats, views: Sequence[View], sparse_points: Floats) -
             is_near = np.isfinite(distances)
             found[rows[is_near]] |= z[is_near] < (1.0 - MARGIN) * known_z[nearest[is_near]]
     return found
+
+
+def have_company(points: Floats, spacings: Floats) -> Bools:
+    """Return which points [P] have :data:`COMPANY` others within :data:`REACH` times their spacing.
+
+    Surfaces are covered densely; what is alone, far behind the scene or in the air, is a mistake of stereo.
+    """
+    if len(points) <= COMPANY:
+        return np.ones(len(points), bool)
+    distances, _ = cKDTree(points).query(points, COMPANY + 1)  # the first is the point itself
+    return distances[:, -1] <= REACH * spacings
 
 
 def choose_spread(points: Floats, spacings: Floats, others: Floats) -> Ints:

@@ -8,7 +8,14 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.strategy.plane_sweep import surface_points
-from minisplat_ref.training.dense_start import SPACING, choose_neighbours, choose_spread, densify_points, stand_before
+from minisplat_ref.training.dense_start import (
+    SPACING,
+    choose_neighbours,
+    choose_spread,
+    densify_points,
+    have_company,
+    stand_before,
+)
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import view_from
@@ -125,6 +132,15 @@ def test_spread_by_hand():
     assert list(choose_spread(points, spacings, np.array([[0.2, 0, 0]]))) == [1, 2, 3, 5]
     assert list(choose_spread(points, np.full(6, 1.5), np.zeros((0, 3)))) == [0, 2, 3, 5]
     assert len(choose_spread(points[:0], spacings[:0], points)) == 0
+
+
+def test_company_by_hand():
+    """Four points of a square of side 1, and one 9 away: within 4 spacings of 0.4 a corner has all others, at 1.41."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [9, 0, 0]])
+    assert list(have_company(points, np.full(5, 0.4))) == [True, True, True, True, False]
+    assert not have_company(points, np.full(5, 0.35)).any()  # 1.4 is less than the diagonal
+    assert have_company(points, np.array([np.inf, 0.1, 0.1, 0.1, 2.3])).tolist() == [True, False, False, False, True]
+    assert have_company(points[:3], np.zeros(3)).all()
 
 
 def test_new_points_keep_their_distance(synthetic, dense):
