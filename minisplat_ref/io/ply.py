@@ -238,8 +238,8 @@ def load_points(path: str | Path) -> PointCloud:
     if missing:
         raise InputError(f"{path}: not a point cloud, it has no property {', '.join(missing)}")
     names = color_names(columns)
-    used = np.stack([columns[name] for name in (*MEANS, *(names or ()))], axis=1, dtype=np.float64)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # the latter of a signalling NaN
+        used = np.stack([columns[name] for name in (*MEANS, *(names or ()))], axis=1, dtype=np.float64)
         is_finite = np.isfinite(used.astype(np.float32)).all(axis=1)  # [P]
     used = used[is_finite]  # [P, 3 or 6]
     points = np.ascontiguousarray(used[:, :3])
