@@ -12,6 +12,7 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
+from minisplat_ref.jit.forking import check_fork
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -89,7 +90,14 @@ def splat(
     -------
     SplatTape
         Its ``output`` is the view.
+
+    Raises
+    ------
+    InputError
+        The process was forked after kernels had run in parallel.
     """
+    if backend.is_compiled:
+        check_fork()
     projection = backend.project(*primitives, camera, conventions)
     channels = shade(projection.radii)  # [N, D]
     if with_depth:
@@ -123,6 +131,8 @@ def splat_vjp(tape: SplatTape, v_image: Floats, v_alpha: Floats) -> SplatGradien
         Zeros for Gaussians that were not visible.
     """
     projection, conventions, backend = tape.projection, tape.conventions, tape.backend
+    if backend.is_compiled:
+        check_fork()
     v = backend.composite_vjp(
         projection, tape.channels, tape.background, tape.bins, conventions, tape.output, v_image, v_alpha
     )

@@ -325,6 +325,19 @@ def view_from(camera: Camera, *, name: str = "", time: float = 0.0) -> View:
     return View(name, camera, np.zeros((0, 0, 3), np.uint8), None, time=time)
 
 
+class Frame(NamedTuple):
+    """Where the coordinates of a scene in memory lie in its files' frame: ``x_file = origin + unit x``."""
+
+    origin: tuple[float, float, float]
+    """In the files' frame and unit."""
+    unit: float
+    """In the files' unit, above 0."""
+
+
+FILE_FRAME = Frame((0.0, 0.0, 0.0), 1.0)
+"""The frame of the files itself."""
+
+
 class Scene(NamedTuple):
     """Photographs split into training and test views, with the sparse points of structure from motion."""
 
@@ -342,3 +355,6 @@ class Scene(NamedTuple):
     """[3] in [0, 1], the colour behind everything; black unless the data say otherwise."""
     extent: float
     """1.1 x the largest distance of a training camera from their mean, world units: scales position learning rates."""
+    frame: Frame = FILE_FRAME
+    """The frame of cameras, points and extent: that of the files, unless :func:`minisplat_ref.io.frames.place_scene`
+    has moved or scaled the scene."""

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
+from data_tools.foreign_files.dialects import as_version_4
 from data_tools.fuzz.mutations import Choose, damage
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
@@ -16,10 +18,12 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import all_formats, find_format
 from minisplat_ref.io import load_ply, load_scene, save_ply, viewpoints, write_image
 from minisplat_ref.io.formats import read_content
+from minisplat_ref.io.frames import place_scene
 from minisplat_ref.io.images import read_image
+from minisplat_ref.io.inventory import take_inventory
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.ply import load_points
-from minisplat_ref.io.ply_file import read_vertices
+from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.golden import files as golden
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
@@ -29,8 +33,9 @@ from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configure
-from minisplat_ref.types import Gaussians
+from minisplat_ref.types import Frame, Gaussians
 
+FRAME = Frame((450_000.0, 5_410_000.0, 260.0), 0.5)
 RECIPE = configure(get_recipe("3dgs-accel"), exposure=True)
 
 
@@ -79,10 +84,15 @@ def _write_colmap_binary(folder: Path) -> None:
     for file in sparse.iterdir():
         file.unlink()
     reconstruction.write_binary(str(sparse))
+    (folder / "masks").mkdir()
+    for name, dtype in (("view_0001", np.uint8), ("view_0002.png", np.uint16)):
+        white = np.full((18, 24), np.iinfo(dtype).max, dtype)
+        Image.fromarray(white).save(folder / "masks" / f"{name}.png")
 
 
 def _read_scene(folder: Path, _: Path) -> object:
-    return load_scene(folder, undistort=True)
+    scene = place_scene(load_scene(folder, undistort=True))
+    return scene, take_inventory(folder, scene)
 
 
 def _write_transforms(folder: Path) -> None:
@@ -118,7 +128,7 @@ def _read_cameras(_: Path, file: Path) -> object:
 
 
 def _write_config(folder: Path) -> None:
-    scene = _scene().scene
+    scene = _scene().scene._replace(frame=FRAME)
     own = settings.Settings(
         "scene", 1, 8, False, RECIPE.name, 10, 10, 0, GSPLAT_MAIN.name, "cpu", set={"exposure": "true"}
     )
@@ -126,11 +136,14 @@ def _write_config(folder: Path) -> None:
 
 
 def _read_config(folder: Path, _: Path) -> object:
-    return settings.load(folder), settings.load_background(folder)
+    return settings.load(folder), settings.load_background(folder), settings.load_frame(folder)
 
 
 def _write_plys(folder: Path) -> None:
-    """Write Gaussians of degree 1 in little- and big-endian bytes and as text, the last two with a colour."""
+    """Write Gaussians of degree 1 in little- and big-endian bytes and as text, the last two with a colour.
+
+    One more file has words of another program, colours as bytes, two scales, centres in double and an infinite opacity.
+    """
     rng = np.random.default_rng(0)
     shapes = ((7, 3), (7, 4), (7, 3), (7,), (7, 3), (7, 3, 3))
     save_ply(folder / "little.ply", Gaussians(*(rng.normal(size=shape).astype(np.float32) for shape in shapes)))
@@ -141,6 +154,12 @@ def _write_plys(folder: Path) -> None:
     (folder / "big.ply").write_bytes(header.format("binary_big_endian").encode() + rows.astype(">f4").tobytes())
     lines = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist())
     (folder / "text.ply").write_text(header.format("ascii") + lines)
+    other = {name: column for name, column in columns.items() if not name.startswith(("f_", "n", "red", "scale_2"))}
+    other = {name.replace("rot_", "quat_"): column for name, column in other.items()}
+    other |= {name: other[name].astype(np.float64) for name in ("x", "y", "z")}
+    other |= {name: np.arange(7, dtype=np.uint8) for name in ("red", "green", "blue")}
+    other["opacity"] = np.where(np.arange(7) == 3, np.float32(np.inf), other["opacity"])
+    write_vertices(folder / "other.ply", other)
 
 
 def _read_ply(_: Path, file: Path) -> object:
@@ -155,6 +174,7 @@ def _write_compact(folder: Path) -> None:
     for _, format_ in all_formats():
         for level in range(len(format_.levels)):
             (folder / f"compact-{level}{format_.suffix}").write_bytes(format_.encode(gaussians, level))
+    (folder / "compact-4.spz").write_bytes(as_version_4((folder / "compact-0.spz").read_bytes()))
 
 
 def _read_compact(_: Path, file: Path) -> object:
@@ -168,6 +188,7 @@ def _write_checkpoint(folder: Path) -> None:
     state = initial_state(_scene().scene, RECIPE, 0)
     state.stats["count"] = np.zeros(len(state.gaussians.means), np.int32)
     state.view_order = [2, 0, 1]
+    state.frame = FRAME
     save_state(folder / "checkpoint.npz", state, RECIPE)
 
 
@@ -204,6 +225,8 @@ def _write_images(folder: Path) -> None:
         write_image(folder / f"image.{suffix}", image)
     for suffix in ("jpg", "bmp"):
         write_image(folder / f"image.{suffix}", image[..., :3])
+    for name, dtype in (("floats", np.float32), ("long", np.int32), ("short", np.uint16)):
+        Image.fromarray((image[..., 0] / 255).astype(dtype)).save(folder / f"image.{name}.tif")
 
 
 def _read_image(_: Path, file: Path) -> object:
@@ -213,7 +236,7 @@ def _read_image(_: Path, file: Path) -> object:
 READERS = {
     "ply": Reader(_write_plys, _read_ply, ("*.ply",)),
     "compact": Reader(_write_compact, _read_compact, ("compact-*",)),
-    "colmap-binary": Reader(_write_colmap_binary, _read_scene, ("sparse/0/*.bin",)),
+    "colmap-binary": Reader(_write_colmap_binary, _read_scene, ("sparse/0/*.bin", "masks/*.png")),
     "colmap-text": Reader(_write_colmap_text, _read_scene, ("sparse/0/*.txt",)),
     "transforms": Reader(_write_transforms, _read_scene, ("transforms.json",)),
     "cameras": Reader(_write_cameras, _read_cameras, ("cameras.json",)),

@@ -9,11 +9,14 @@ which and what to do), 130 interrupted. A programming error keeps its traceback.
 """
 
 import argparse
+import io
+import logging
 import os
 import sys
 import textwrap
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TextIO
 
 from minisplat_ref import __version__
@@ -133,13 +136,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, 2 for bad input, 130 when interrupted.
     """
     argv = sys.argv[1:] if argv is None else argv
-    with warnings.catch_warnings():
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its caches of fonts
+    with warnings.catch_warnings(), _printing_any_name():
         _print_warnings_in_one_line()
         return _run(argv)
 
 
+@contextmanager
+def _printing_any_name() -> Iterator[None]:
+    """Have characters that the terminal's code page lacks printed as escapes, instead of ending the command."""
+    streams = [stream for stream in (sys.stdout, sys.stderr) if isinstance(stream, io.TextIOWrapper)]
+    strict = [stream for stream in streams if stream.errors in ("strict", "surrogateescape")]
+    before = [str(stream.errors) for stream in strict]
+    for stream in strict:
+        stream.reconfigure(errors="backslashreplace")
+    try:
+        yield
+    finally:
+        for stream, errors in zip(strict, before, strict=True):
+            if not stream.closed:
+                stream.reconfigure(errors=errors)
+
+
 def _print_warnings_in_one_line() -> None:
-    """Have warnings about the input printed like errors, without the line of our source that gave them."""
+    """Have warnings about the input printed like errors, without the line of our source that gave them.
+
+    What NumPy says of an overflow, and matplotlib of a letter that its font lacks, helps no user and is left out.
+    """
     show = warnings.showwarning
 
     def show_input_warning(
@@ -152,7 +175,7 @@ def _print_warnings_in_one_line() -> None:
     ) -> None:
         if issubclass(category, InputWarning):
             print(f"minisplat-ref: warning: {message}", file=sys.stderr)
-        else:
+        elif not (issubclass(category, RuntimeWarning) or str(message).startswith("Glyph ")):
             show(message, category, filename, lineno, file, line)
 
     warnings.simplefilter("always", InputWarning)

@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,7 +60,7 @@ def add_parser(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
     from minisplat_ref.io.formats import write_content
-    from minisplat_ref.runs.conversion import check_population, choose_format, open_source
+    from minisplat_ref.runs.conversion import check_population, choose_format, encode_as, open_source
 
     out: Path = args.output
     format_ = choose_format(out)
@@ -77,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
         lines = []
     else:
         check_population(source.model.gaussians, format_, source.what)
+        format_ = format_._replace(encode=partial(encode_as, format_, out))
         choice, measured = _choose(args, source, format_)
         write_content(out, choice.content)
         rows = [*format_.describe(choice.content, out), *measured]

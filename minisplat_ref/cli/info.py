@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.arguments import Commands, HelpFormatter
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, one_line
 
 if TYPE_CHECKING:
     from minisplat_ref.runs.settings import Settings
@@ -45,6 +45,7 @@ def add_parser(commands: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument("path", type=Path, metavar="FILE", help="any of the above")
+    parser.add_argument("--model", metavar="M", help="folder of the COLMAP model in a scene (default sparse/0)")
     parser.set_defaults(run=run)
 
 
@@ -53,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.runs.run_folder import CONFIG
 
     path: Path = args.path
+    if args.model is not None and not path.is_dir():
+        raise InputError(f"--model is for a scene with a COLMAP model, and {path} is none: leave it out")
     if not path.exists():
         raise InputError(f"{path} does not exist: give a file or folder to look into")
     if path.suffix == ".ply":
@@ -62,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     elif (path / CONFIG).exists():
         rows = _run_rows(path)
     elif path.is_dir() or path.suffix == ".json":
-        rows = _scene_rows(path)
+        rows = _scene_rows(path, args.model)
     else:
         rows = _compact_rows(path)
     width = max(len(name) for name, _ in rows)
@@ -96,11 +99,14 @@ def _compact_rows(path: Path) -> Rows:
 
 def _checkpoint_rows(path: Path) -> Rows:
     from minisplat_ref.io.checkpoint import load_checkpoint
-    from minisplat_ref.training.saved_state import check_fields, read_counters, written_by
+    from minisplat_ref.io.frames import return_fields
+    from minisplat_ref.training.representation import WORLD_UNITS
+    from minisplat_ref.training.saved_state import check_fields, read_counters, read_frame, written_by
 
     arrays, metadata = load_checkpoint(path)
     fields = _group(arrays, "gaussians")
     check_fields(path, fields)
+    fields = return_fields(fields, WORLD_UNITS, read_frame(path, metadata))
     rows = [
         ("iteration", f"{read_counters(path, metadata).step:,}"),
         ("recipe", "{} for {} iterations".format(*written_by(metadata))),
@@ -172,16 +178,20 @@ def _event_rows(folder: Path, settings: "Settings") -> Rows:
     return [*rows, *([(name, ", ".join(never))] if never else [])]
 
 
-def _scene_rows(path: Path) -> Rows:
+def _scene_rows(path: Path, model: str | None) -> Rows:
     from minisplat_ref.io import load_scene
-    from minisplat_ref.runs.notices import describe_sizes
+    from minisplat_ref.io.frames import place_scene
+    from minisplat_ref.io.inventory import take_inventory
+    from minisplat_ref.runs.notices import describe_place, describe_sizes
 
-    scene = load_scene(path, undistort=True)
+    scene = load_scene(path, undistort=True, model=model)
+    place = describe_place(place_scene(scene))
     views = (*scene.train_views, *scene.test_views)
     focals = sorted(view.camera.fx for view in views)
     n_masks = sum(view.mask is not None for view in views)
     return [
         ("scene", scene.name),
+        ("files", one_line(take_inventory(path, scene, model).line)),
         ("views", f"{len(views)}: {len(scene.train_views)} training, {len(scene.test_views)} test"),
         ("image sizes", describe_sizes([(view.camera.width, view.camera.height) for view in views])),
         ("focal length", f"{focals[0]:.1f} to {focals[-1]:.1f} px"),
@@ -189,6 +199,7 @@ def _scene_rows(path: Path) -> Rows:
         ("points", f"{len(scene.points):,}"),
         *_bounds_rows(scene.points),
         ("extent", f"{scene.extent:.4g} world units"),
+        *([("frame", place)] if place else []),
         ("background", _vector(scene.background)),
     ]
 

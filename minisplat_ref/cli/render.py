@@ -22,6 +22,7 @@ from minisplat_ref.errors import InputError
 if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
     from minisplat_ref.runs.scoring import Trained
+    from minisplat_ref.types import Frame
 
 DESCRIPTION = """\
 Render a run (its --out folder), or Gaussians that any program wrote: a PLY or a
@@ -115,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     for name, output in zip(names, drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
-            depth = expected_depth(output.image[..., 3], output.alpha)  # [H, W]
+            depth = source.frame.unit * expected_depth(output.image[..., 3], output.alpha)  # [H, W] as in the files
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_image(depth, *depth_range(depth)))
     print(f"{len(views)} images in {out}")
@@ -156,8 +157,10 @@ class _Source(NamedTuple):
     """What to render, and from where unless the command line says otherwise."""
 
     trained: "Trained"
+    """In its frame, like the cameras."""
     cameras: "list[Viewpoint]"
     default_out: Path
+    frame: "Frame"
 
 
 def _open(args: argparse.Namespace) -> _Source:
@@ -174,25 +177,38 @@ def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
     from minisplat_ref.io import viewpoints
     from minisplat_ref.runs import run_folder
     from minisplat_ref.runs.scoring import load_trained
+    from minisplat_ref.runs.settings import load_frame
 
     if args.extension is not None:
         raise InputError(f"{folder} has its extension recorded: leave out --extension {args.extension}")
-    return _Source(load_trained(folder), viewpoints.read(folder / run_folder.CAMERAS), folder / "views")
+    frame = load_frame(folder)
+    cameras = _place(viewpoints.read(folder / run_folder.CAMERAS), frame)
+    return _Source(load_trained(folder), cameras, folder / "views", frame)
 
 
 def _open_file(path: Path, args: argparse.Namespace) -> _Source:
     import numpy as np
 
     from minisplat_ref.extensions.extension import CORE, load_extension
+    from minisplat_ref.io.frames import frame_of_means
     from minisplat_ref.runs.conversion import read_population
     from minisplat_ref.runs.scoring import Trained
+    from minisplat_ref.runs.settings import place_model
     from minisplat_ref.types import Model
 
     owner = CORE if args.extension is None else load_extension(args.extension)
     representation = owner.representation
     model = Model(read_population(path, owner))
-    trained = Trained(model, representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
-    return _Source(trained, [], path.with_name(f"{path.stem}-views"))
+    frame = frame_of_means(model.gaussians.means)
+    trained = Trained(place_model(model, owner, frame), representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
+    return _Source(trained, [], path.with_name(f"{path.stem}-views"), frame)
+
+
+def _place(views: "list[Viewpoint]", frame: "Frame") -> "list[Viewpoint]":
+    """Return viewpoints of the files in the frame of the model."""
+    from minisplat_ref.io.frames import place_camera
+
+    return [view._replace(camera=place_camera(view.camera, frame)) for view in views]
 
 
 def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]":
@@ -206,7 +222,7 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
         means = source.trained.model.gaussians.means
         return orbits.orbit(means, followed, args.frames, width, height, args.arc)
     if which not in RUN_CAMERAS:
-        return viewpoints.read(Path(which))
+        return _place(viewpoints.read(Path(which)), source.frame)
     if not source.cameras:
         raise InputError(f"--cameras {which} needs a run folder: give --cameras orbit or a JSON file with {args.input}")
     views = [view for view in source.cameras if which in ("all", view.split)]

@@ -31,10 +31,11 @@ N_ITERATIONS = 3000  # of recipes with a schedule
 SIMPLIFIED = "simplified"  # the run inside of a run that --max-drop and --max-bytes leave
 MINUTES_MIN = 0.1  # the first iterations take seconds, to compile what has not been
 
-DEFAULTS = {
+DEFAULTS: dict[str, Any] = {
     "downscale": 1,
     "test_every": 8,
     "undistort": False,
+    "model": None,
     "recipe": "adaptive",
     "iterations": None,
     "budget": None,
@@ -58,8 +59,7 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
-DIR will hold report.html, point_cloud.ply, metrics.json, renders/ of the test
-views and checkpoints. Ctrl-C saves what there is; --resume continues.
+DIR will hold report.html, point_cloud.ply, metrics.json, renders/, checkpoints.
 """
 EPILOG = """\
 example:
@@ -81,7 +81,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="new folder for the results (default runs/SCENE-RECIPE)"
     )
-    parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its last checkpoint")
+    parser.add_argument(
+        "--resume", type=Path, metavar="DIR", help="continue the run in DIR; Ctrl-C saves what there is"
+    )
     parser.add_argument("--scene", dest="moved", metavar="PATH", help="with --resume: where its photographs are now")
     parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
 
@@ -96,6 +98,7 @@ def add_parser(commands: Commands) -> None:
         "--background", type=color, metavar="R,G,B", help="behind the scene (default 0,0,0; white 255,255,255)"
     )
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
+    data.add_argument("--model", metavar="M", help="folder of the COLMAP model in SCENE (default sparse/0)")
 
     training = parser.add_argument_group("training")
     training.add_argument(
@@ -186,15 +189,16 @@ def _start(given: dict[str, Any]) -> int:
 
     from minisplat_ref.runs import curve, run_folder
     from minisplat_ref.runs.first_use import compile_kernels
-    from minisplat_ref.runs.notices import warn_of_scene
+    from minisplat_ref.runs.notices import report_inventory, warn_of_scene
     from minisplat_ref.runs.proposed_size import propose
-    from minisplat_ref.runs.settings import Settings, load_lpips, load_photographs, recipe_of
+    from minisplat_ref.runs.settings import Settings, check_frame, load_lpips, load_photographs, recipe_of
 
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
     recipe = recipe_of(settings)
     _check_time(settings, recipe)
     scene = load_photographs(settings)
+    check_frame(settings, scene)
     if settings.eval_every:
         curve.check_views(scene)
     network = load_lpips(settings, scene)
@@ -204,6 +208,7 @@ def _start(given: dict[str, Any]) -> int:
     compile_kernels(settings.backend)
     run_folder.create(folder)
     warn_of_scene(scene, settings.downscale, is_dense=recipe.starts_densely)
+    report_inventory(Path(settings.scene), scene, settings.model)
     proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
     if proposal is not None:
         print(f"minisplat-ref: {proposal}", file=sys.stderr)
@@ -301,7 +306,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         if "rescale" in given:
             ours = ours._replace(schedule_iterations=ours.iterations)
         recipe = settings.recipe_of(ours)
-        scene = settings.load_photographs(ours)
+        scene = settings.load_photographs(ours, settings.load_frame(folder))
         fingerprint.check(folder, scene, ours.scene)
         network = settings.load_lpips(ours, scene)
         state = _first_state(ours, scene, recipe) if state is None else state
@@ -345,7 +350,7 @@ def _train(
     room: str,
 ) -> int:
     from minisplat_ref.runs import checkpoints, run_folder
-    from minisplat_ref.runs.notices import describe_sizes
+    from minisplat_ref.runs.notices import describe_place, describe_sizes
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
     from minisplat_ref.training.guard import Guard
@@ -355,6 +360,8 @@ def _train(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
         f" {describe_sizes([(view.camera.width, view.camera.height) for view in views])}, {len(scene.points):,} points"
     )
+    if place := describe_place(scene):
+        print(place)
     if room:
         print(room)
     check_every = given.get("check_every", Guard().every)

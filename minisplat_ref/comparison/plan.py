@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_scene
+from minisplat_ref.io.frames import place_scene
 from minisplat_ref.lpips import check_views, load_network
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.start import load_start
@@ -141,7 +142,7 @@ def check(plan: Plan) -> Scene:
     for option in plan.options:
         if not any(_takes(recipe.name, option) for recipe in recipes):
             raise InputError(f"--{option.replace('_', '-')} means nothing to {', '.join(plan.recipes)}: leave it out")
-    scene = load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every)
+    scene = place_scene(load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every))
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare on: give --test-every above 0")
     if plan.lpips_weights is not None:

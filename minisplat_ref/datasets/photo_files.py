@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.images import IMAGE_SUFFIXES
+from minisplat_ref.io.images import BY_PRODUCT, IMAGE_SUFFIXES
 
 UNREAD_SUFFIXES = (
     *(".heic", ".heif", ".avif", ".jxl"),
@@ -20,7 +20,6 @@ UNREAD_SUFFIXES = (
 """Formats of phones and cameras that Pillow does not decode."""
 MASKS = "masks"
 """Folder of masks beside the photographs."""
-BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)  # of a file or a folder
 SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
 NAMED_MAX = 20  # files that a message names
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.io.colmap import colmap_photos, find_model, read_model
+from minisplat_ref.io.colmap import colmap_photos, find_model, read_model, write_model
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
@@ -88,7 +88,10 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
     pycolmap = import_quiet_pycolmap()
     with tempfile.TemporaryDirectory(dir=out) as temporary:
         quality = SAVE_OPTIONS["JPEG"]["quality"]
-        pycolmap.undistort_images(temporary, str(find_model(scene)), str(scene / "images"), jpeg_quality=quality)
+        model = Path(temporary, "model")
+        model.mkdir()
+        write_model(scene, model)
+        pycolmap.undistort_images(temporary, str(model), str(scene / "images"), jpeg_quality=quality)
         (out / "sparse").mkdir()
         shutil.move(Path(temporary, "images"), out / "images")
         shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")

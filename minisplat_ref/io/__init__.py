@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, load_colmap
@@ -29,6 +30,7 @@ def load_scene(
     test_every: int = 8,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
+    model: str | None = None,
 ) -> Scene:
     """Load a scene of photographs with cameras, whichever way it is described.
 
@@ -38,6 +40,8 @@ def load_scene(
         Folder of a COLMAP scene or of a transforms.json (COLMAP wins where both are there), or a transforms.json file.
     downscale, test_every, background, undistort
         See :func:`load_colmap` and :func:`load_transforms`.
+    model : str, optional
+        Folder of a COLMAP model, relative to ``path``, where there are several.
 
     Returns
     -------
@@ -51,14 +55,14 @@ def load_scene(
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
-    if find_model(path) is not None:
-        load = load_colmap
-    elif find_transforms(path):
-        load = load_transforms
-    else:
-        models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
-        raise InputError(
-            f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"
-            " to make one from photographs run `minisplat-ref sfm PHOTOS --out SCENE`"
-        )
-    return load(path, downscale=downscale, test_every=test_every, background=background, undistort=undistort)
+    options: dict[str, Any] = {"downscale": downscale, "test_every": test_every, "background": background}
+    options["undistort"] = undistort
+    if find_model(path, model) is not None:
+        return load_colmap(path, model=model, **options)
+    if find_transforms(path):
+        return load_transforms(path, **options)
+    models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
+    raise InputError(
+        f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"
+        " to make one from photographs run `minisplat-ref sfm PHOTOS --out SCENE`"
+    )

@@ -9,7 +9,7 @@ and images that COLMAP could not register.
 import re
 import struct
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.colmap_text import read_text, readable, text_names
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
-from minisplat_ref.io.names import is_file, name_inside
+from minisplat_ref.io.names import name_inside, spelled_on_disk
+from minisplat_ref.io.ply import NO_POINTS, PointCloud, load_points
 from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
 from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
+POINTS_PLY = "points3D.ply"  # which 3DGS and its viewers write beside the model's points
 N_IMAGES = re.compile(r"# Number of images: (\d+)")  # in a model as text
 
 
@@ -55,6 +58,7 @@ def load_colmap(
     test_every: int = 8,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
+    model: str | None = None,
 ) -> Scene:
     """Load a COLMAP scene.
 
@@ -71,6 +75,8 @@ def load_colmap(
         Colour behind everything, in [0, 1]; black by default.
     undistort : bool
         Warp images of other camera models to a pinhole, instead of refusing them.
+    model : str, optional
+        Folder of the model, relative to ``path``, where there are several; the first of those above by default.
 
     Returns
     -------
@@ -83,21 +89,63 @@ def load_colmap(
     """
     path = Path(path)
     reading = build_reading(downscale, background, undistort, alpha_is_mask=True)
-    reconstruction = read_model(path)
+    reconstruction = read_model(path, model)
     train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every)
     points, colors = _points(reconstruction)
+    if not len(points):
+        points, colors = _points_beside(path, find_model(path, model))
     return build_scene(path, train_photos, test_photos, points, colors, reading)
 
 
-def find_model(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model of a scene, None if it has none."""
-    folders = (path / folder for folder in MODEL_FOLDERS)
-    return next((f for f in folders if (f / "cameras.bin").is_file() or (f / "cameras.txt").is_file()), None)
+def has_model(folder: Path) -> bool:
+    """Return whether a folder holds a COLMAP model."""
+    return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
 
 
-def read_model(path: Path) -> Any:
-    """Read the COLMAP model of the scene at ``path`` as a ``pycolmap.Reconstruction``."""
-    model = find_model(path)
+def find_model(path: Path, name: str | None = None) -> Path | None:
+    """Return the folder of the COLMAP model of a scene, None if it has none.
+
+    Parameters
+    ----------
+    path : Path
+        The scene.
+    name : str, optional
+        Which model, relative to the scene; by default the first that is there.
+
+    Raises
+    ------
+    InputError
+        There is no such model.
+    """
+    if name is not None:
+        if not has_model(path / name):
+            found = sorted(f.relative_to(path).as_posix() for f in (path / "sparse").rglob("*") if has_model(f))
+            raise InputError(
+                f"{path / name}: no COLMAP model, neither cameras.bin nor cameras.txt; --model takes a folder relative"
+                f" to the scene{f', such as {found[0]}' if found else ''}"
+            )
+        return path / name
+    return next((f for f in (path / folder for folder in MODEL_FOLDERS) if has_model(f)), None)
+
+
+def image_names(model: Path) -> set[str]:
+    """Return the names of all images of a model, without reading the rest of it.
+
+    Raises
+    ------
+    InputError
+        Its file of images cannot be read.
+    """
+    binary, text = model / "images.bin", model / "images.txt"
+    if (model / "cameras.bin").is_file():
+        content = binary.read_bytes() if binary.is_file() else b""
+        return {name.decode(errors="replace") for _, name in _records(binary, content, BINARY_RECORDS["images.bin"])}
+    return set(text_names(text).values()) if text.is_file() else set()
+
+
+def read_model(path: Path, name: str | None = None) -> Any:
+    """Read the COLMAP model of the scene at ``path`` as a ``pycolmap.Reconstruction``; ``name`` as for find_model."""
+    model = find_model(path, name)
     if model is None:
         raise InputError(
             f"{path}: no COLMAP model, looked for cameras.bin or cameras.txt in {' and '.join(MODEL_FOLDERS)};"
@@ -112,7 +160,8 @@ def read_model(path: Path) -> Any:
         _check_text_images(model / "images.txt")
     pycolmap = import_pycolmap()
     try:
-        reconstruction = pycolmap.Reconstruction(str(model))
+        with readable(model) as folder:
+            reconstruction = pycolmap.Reconstruction(str(folder))
     except DAMAGE_ERRORS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{model}: damaged or incomplete COLMAP model ({reason}); copy or export it again") from None
@@ -121,7 +170,19 @@ def read_model(path: Path) -> Any:
         found = (model / "cameras.bin").stat().st_size
         if found < size:  # pycolmap does not notice
             raise InputError(f"{model / 'cameras.bin'}: truncated, {found} of {size} bytes; copy or export it again")
+    else:
+        for image_id, text in text_names(model / "images.txt").items():
+            if reconstruction.exists_image(image_id) and " " in text:
+                reconstruction.image(image_id).name = text
     return reconstruction
+
+
+def write_model(path: Path, folder: Path) -> None:
+    """Write the model of a scene as pycolmap reads it, with the names that the photographs have on disk."""
+    reconstruction = read_model(path)
+    for image in reconstruction.images.values():
+        image.name = spelled_on_disk(path / "images", _name(path, image))
+    reconstruction.write_binary(str(folder))
 
 
 def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
@@ -130,9 +191,10 @@ def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
     if not folder.is_dir():
         raise InputError(f"{path}: no folder images/; put the photographs there, named as in the model")
     seen = _point_ids(reconstruction)
+    masks = _mask_files(path / "masks")
     names = {image_id: _name(path, image) for image_id, image in reconstruction.images.items()}
     registered = [(names[image_id], image) for image_id, image in reconstruction.images.items() if image.has_pose]
-    return [_photo(path, folder, name, image, seen) for name, image in registered]
+    return [_photo(path, folder, name, image, seen, masks) for name, image in registered]
 
 
 def _name(path: Path, image: Any) -> str:
@@ -145,10 +207,17 @@ def _name(path: Path, image: Any) -> str:
         ) from None
 
 
-def _photo(path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, Ints] | None) -> Photo:
+def _mask_files(masks: Path) -> dict[str, Path]:
+    """Return the files of a folder by their names relative to it, without regard to upper and lower case."""
+    files = sorted(masks.rglob("*"), reverse=True) if masks.is_dir() else []  # of two, lower case wins: it sorts last
+    return {file.relative_to(masks).as_posix().casefold(): file for file in reversed(files)}
+
+
+def _photo(
+    path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, Ints] | None, masks: Mapping[str, Path]
+) -> Photo:
     """Return a registered image of the model, with the points that it sees if there are tracks."""
-    masks = path / "masks"
-    candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
+    candidates = (f"{name}.png", Path(name).with_suffix(".png").as_posix())
     pose = image.cam_from_world().matrix()  # [3, 4]
     model = image.camera
     if len(model.focal_length_idxs()) == 0:  # asking it for a focal length would abort the process
@@ -166,9 +235,9 @@ def _photo(path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, I
         width=model.width,
         height=model.height,
     )
-    mask_path = next((c for c in candidates if is_file(c)), None)
+    mask_path = next((masks[c.casefold()] for c in candidates if c.casefold() in masks), None)
     point_ids = None if seen is None else seen.get(image.image_id, np.zeros(0, np.int64))
-    return Photo(folder, name, mask_path, camera, _lens(model), point_ids)
+    return Photo(folder, spelled_on_disk(folder, name), mask_path, camera, _lens(model), point_ids)
 
 
 def _lens(camera: Any) -> Lens | None:
@@ -200,13 +269,23 @@ def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 
 
+def _points_beside(path: Path, model: Path | None) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the points of the PLY that some programs leave in the place of the model's own; none without one."""
+    file = None if model is None else model / POINTS_PLY
+    cloud: PointCloud = NO_POINTS if file is None or not file.is_file() else load_points(file)
+    if not len(cloud.points):
+        message = f"{path}: the model has no sparse points; give some to start from by --init PLY, or run sfm"
+        warnings.warn(one_line(message), InputWarning, stacklevel=3)
+    return cloud.points, cloud.colors
+
+
 def _check_text_images(file: Path) -> None:
     """Refuse a text file of images in which second lines are missing; warn if its heading states more images.
 
     An image takes two lines, the second of which lists its 2D features and is empty if there are none. Where a program
     has left out empty lines, pycolmap takes every second image for the features of the one before.
     """
-    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = read_text(file).splitlines()
     # Features are triples of numbers; an image has nine numbers and a name.
     n_images = sum(len(line.split()) % 3 != 0 for line in lines if not line.startswith("#"))
     n_read = 0
@@ -234,15 +313,29 @@ def _check_text_images(file: Path) -> None:
 
 def _check_records(file: Path, layout: Records) -> None:
     """Check the records of a binary file before pycolmap reads it, which takes missing bytes for counts and hangs."""
-    content = file.read_bytes()
+    for _ in _records(file, file.read_bytes(), layout):
+        pass
+
+
+def _records(file: Path, content: bytes, layout: Records) -> Iterator[tuple[int, bytes]]:
+    """Yield the offset and the name, empty without one, of each record of a binary file.
+
+    Raises
+    ------
+    InputError
+        The file ends before its last record.
+    """
     offset = 8
     try:
         for _ in range(struct.unpack_from("<Q", content)[0]):
+            begin, name = offset, b""
             offset += layout.n_fixed
             if layout.has_name:
-                offset = content.index(b"\0", offset) + 1
+                end = content.index(b"\0", offset)
+                name, offset = content[offset:end], end + 1
             (n_items,) = struct.unpack_from(layout.count_format, content, offset)
             offset += struct.calcsize(layout.count_format) + n_items * layout.n_item
+            yield begin, name
     except (struct.error, ValueError, OverflowError):  # the last of an offset that is no index
         offset = len(content) + 1
     if offset > len(content):

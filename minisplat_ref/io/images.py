@@ -2,12 +2,15 @@
 
 Pixels come as the file stores them: an EXIF orientation is not applied, because cameras describe the stored grid
 (``minisplat-ref sfm`` turns photographs upright before it estimates cameras). Files of 16 bits a channel keep the upper
-8. Resizing uses Pillow's LANCZOS for colours, which averages over the widened filter when it shrinks and so does not
-alias, and area means for masks. Left out: colour profiles, raw formats, high dynamic range.
+8, floats from 0 to 1 become 0 to 255. Which value is white is never guessed from the values of a file: 32-bit integers,
+and floats beyond 0 to 1, are refused. Resizing uses Pillow's LANCZOS for colours, which averages over the widened
+filter when it shrinks and so does not alias, and area means for masks. Left out: colour profiles, raw formats, high
+dynamic range.
 """
 
 import io
 import os
+import re
 import struct
 import threading
 import warnings
@@ -28,7 +31,13 @@ from minisplat_ref.types import Bools, Floats
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
+BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)
+"""Files and folders that are hidden, or that programs put beside photographs."""
+
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"quality": 95}}
+SOURCE = "minisplat_ref source"  # key of an opened image's path among its data, for messages on its values
+SIXTEEN_BIT_FORMATS = ("PNG", "PPM")  # whose 16-bit images some versions of Pillow keep in 32 bits
+HALF_LEVEL = 0.5 / 255.0  # by which a float may be outside 0 to 1: it rounds to black or white all the same
 PIXELS_MAX = 2**29  # per image: more than cameras have, and 1.6 GB in memory
 PLAUSIBLE_PIXELS = 100_000_000  # up to this size, an image may be compressed into any number of bytes
 PIXELS_PER_BYTE = 10_000  # limit for larger ones: a white 1-bit PNG has 8256 pixels per byte
@@ -59,6 +68,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
                         f"{path}: {image.width} x {image.height} pixels cannot be in {file.n_bytes} bytes; copy or"
                         " export the file again"
                     )
+                image.info[SOURCE] = str(path)
                 yield image
     except InputError:
         raise
@@ -114,13 +124,41 @@ def is_turned(path: str | Path) -> bool:
         return image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
 
 
+def has_transparency(path: str | Path) -> bool:
+    """Return whether the file has an alpha channel or a transparent colour, from its header alone."""
+    with open_image(Path(path)) as image:
+        return image.has_transparency_data
+
+
+def white_of(image: Image.Image) -> float:
+    """Return the value that is white in an open image file.
+
+    Raises
+    ------
+    InputError
+        The file does not say: integers of 32 bits have no agreed range.
+    """
+    if image.mode == "F":
+        return 1.0
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format in SIXTEEN_BIT_FORMATS):
+        return 65535.0
+    if image.mode == "I":
+        low, high = image.getextrema()
+        raise InputError(
+            f"{_source(image)}: integers of 32 bits, from {low} to {high}, do not say which value is white; export the"
+            " image with 8 or 16 bits a channel"
+        )
+    return 255.0
+
+
 def read_image(path: str | Path) -> NDArray[np.uint8]:
     """Read an image file as 8-bit RGB, or RGBA where the file has transparency.
 
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG or whatever else Pillow decodes; gray, palette, CMYK and 16-bit files are converted.
+        PNG, JPEG or whatever else Pillow decodes; gray, palette, CMYK and 16-bit files are converted, and floats from
+        0 to 1.
 
     Returns
     -------
@@ -130,7 +168,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     Raises
     ------
     InputError
-        If the file is missing, is not an image or is truncated.
+        If the file is missing, is not an image, is truncated, or does not say which value is white.
     """
     with open_image(Path(path)) as image:
         return pixels_of(image)
@@ -138,11 +176,29 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
 
 def pixels_of(image: Image.Image) -> NDArray[np.uint8]:
     """Return the pixels of an opened image as :func:`read_image` does, [H, W, 3] or [H, W, 4]."""
-    if image.mode.startswith("I"):  # gray of 16 bits; Pillow itself keeps the upper byte of 16-bit colour files
-        gray = (np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
+    white = white_of(image)
+    if white != 255.0:  # gray; Pillow itself keeps the upper byte of 16-bit colour files
+        levels = np.asarray(image)  # [H, W]
+        gray = _floats_as_bytes(_source(image), levels) if white == 1.0 else (levels >> 8).clip(0, 255).astype(np.uint8)
         return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
     mode = "RGBA" if image.has_transparency_data else "RGB"
     return np.array(image if image.mode == mode else image.convert(mode))  # converting would copy it in any case
+
+
+def _source(image: Image.Image) -> str:
+    """Return the path of an opened image, for messages."""
+    return str(image.info.get(SOURCE, "an image"))
+
+
+def _floats_as_bytes(path: str, levels: Floats) -> NDArray[np.uint8]:
+    """Return floats from 0 to 1 as bytes; refuse others, except for what rounding would hide."""
+    low, high = levels.min(), levels.max()
+    if not (low >= -HALF_LEVEL and high <= 1.0 + HALF_LEVEL):  # True for NaN
+        raise InputError(
+            f"{path}: floats from {low:g} to {high:g}, but 1 is white and 0 black; scale the values to 0 to 1 and clip"
+            " them, or export the image with 8 or 16 bits a channel"
+        )
+    return np.rint(255.0 * levels.clip(0.0, 1.0)).astype(np.uint8)
 
 
 def read_mask(path: str | Path) -> Bools:
@@ -185,8 +241,12 @@ def resize_image(image: NDArray[np.uint8], width: int, height: int) -> NDArray[n
 
 def resize_mask(mask: Bools, width: int, height: int) -> Bools:
     """Resize [H, W] to [height, width]; a pixel counts when at least half of its area does."""
-    area = Image.fromarray(mask.astype(np.float32)).resize((width, height), Image.Resampling.BOX)
-    return np.asarray(area) >= 0.5
+    return mask_areas(mask, width, height) >= 0.5
+
+
+def mask_areas(mask: Bools, width: int, height: int) -> Floats:
+    """Return the share of each pixel [height, width] that a mask [H, W] covers."""
+    return np.asarray(Image.fromarray(mask.astype(np.float32)).resize((width, height), Image.Resampling.BOX))
 
 
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -11,8 +11,10 @@ owner of the disk put it there.
 
 import os
 import re
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote
 
 from minisplat_ref.errors import InputError
 
@@ -27,6 +29,19 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):  # too long, or with a zero byte
         return False
+
+
+def spelled_on_disk(folder: Path, name: str) -> str:
+    """Return the name by which a file is there: as given, or as another system would take it for the same.
+
+    Windows and macOS take ``a.JPG`` for ``a.jpg``, Windows writes backslashes, macOS may decompose accents, and some
+    exporters write names as in addresses, ``a%20b.jpg``.
+    """
+    suffix = Path(name).suffix
+    stem = name[: len(name) - len(suffix)]
+    forms = [name, stem + suffix.lower(), stem + suffix.upper(), name.replace("\\", "/")]
+    forms += [unquote(name), *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
+    return next((form for form in forms if ".." not in Path(form).parts and is_file(folder / form)), name)
 
 
 def name_inside(name: str, source: str | Path) -> str:

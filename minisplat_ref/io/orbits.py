@@ -160,7 +160,8 @@ def _find_covered(angles: Floats) -> tuple[float, float]:
 
 def _path_of_means(means: Floats, width: int, height: int) -> _Path:
     target = np.median(means, axis=0) if len(means) else np.zeros(3)  # [3]; floaters do not move a median
-    reach = float(np.quantile(np.linalg.norm(means - target, axis=1), 0.9)) if len(means) else 1.0
+    offsets = means.astype(np.float64) - target  # [N, 3]
+    reach = float(np.quantile(np.linalg.norm(offsets, axis=1), 0.9)) if len(means) else 1.0
     focal = 0.5 * width / math.tan(0.5 * FOV)
     distance = max(reach, 1e-6) / math.sin(math.atan(0.5 * min(width, height) / focal))
     up = np.array([0.0, -1.0, 0.0])

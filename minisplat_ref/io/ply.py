@@ -5,20 +5,22 @@ The 3DGS layout holds one vertex per Gaussian: ``x y z``, normals (unused, zero)
 channel-major: all red coefficients, then all green, then all blue, whereas :class:`Gaussians` keeps RGB last. Rotations
 are wxyz, the frame is COLMAP's (x right, y down, z forward).
 
-Files are read by property name, so order, normals and extra properties do not matter; :mod:`.ply_file` reads the bytes.
+Files are read by property name, so order, normals and extra properties do not matter; :mod:`.ply_file` reads the bytes,
+:mod:`.ply_dialects` knows what other programs call the properties.
 Left out: compressed variants.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.ply_dialects import as_usual, renamed
 from minisplat_ref.io.ply_file import n_rows_of, property_names, read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
@@ -29,6 +31,16 @@ SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLORS = ("red", "green", "blue")
+PRECISION = 1e-4  # of its largest scale, by which rounding may move a centre; it is 1e-5 in a scene at the origin
+COLOR_NAMES = (
+    COLORS,
+    ("r", "g", "b"),
+    *(tuple(f"{word}{color}" for color in COLORS) for word in ("diffuse_", "vertex_", "ambient_", "color_", "scalar_")),
+    ("color_r", "color_g", "color_b"),
+    SH_DC,
+)
+"""Names of colours in the PLY files of different programs, upper case aside; the first that are there count."""
+
 GRAY = 128  # colour of a point cloud that has none
 
 
@@ -52,9 +64,10 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     Raises
     ------
     InputError
-        If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, infinity or a zero quaternion.
+        If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, a zero quaternion, or an infinity other
+        than those that :mod:`.ply_dialects` understands.
     """
-    columns = read_vertices(path)
+    columns = as_usual(path, read_vertices(path))
     rest_names = _sh_rest_names(columns, path)
     further = {field: _further_names(columns, field) for field in population._fields if field not in Gaussians._fields}
     names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
@@ -105,12 +118,19 @@ def further_properties(path: str | Path) -> tuple[str, ...]:
     InputError
         If the file cannot be opened or its header is malformed.
     """
-    usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS}
-    return tuple(name for name in property_names(path) if name not in usual and not name.startswith("f_rest_"))
+    names = property_names(path)
+    others = renamed(names)
+    usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS, *others}
+    if not any(others.get(name, name) in SH_DC for name in names):
+        usual |= set(color_names(names) or ())
+    return tuple(name for name in names if name not in usual and not name.startswith("f_rest_"))
 
 
 def save_ply(path: str | Path, gaussians: Any) -> None:
     """Write trained Gaussians as a PLY in the 3DGS layout: binary, little-endian, float32, with zero normals.
+
+    Centres in float64 that float32 would move by much of the Gaussians' size, such as those of a scene in UTM
+    coordinates, become properties of type double.
 
     Parameters
     ----------
@@ -141,9 +161,20 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
     columns: dict[str, NDArray] = {}  # where they are float32, views: a large population is not copied
     with np.errstate(over="ignore"):  # becomes infinite, which check_finite names
         for names, values in fields:
-            columns |= zip(names, (column.astype(np.float32, copy=False) for column in values), strict=True)
+            dtype = np.float64 if names == MEANS and are_far(gaussians) else np.float32
+            columns |= zip(names, (column.astype(dtype, copy=False) for column in values), strict=True)
     check_finite(path, columns)
     write_vertices(path, columns)
+
+
+def are_far(gaussians: Any) -> bool:
+    """Return whether centres lie so far from the origin that in float32 most would move by much of their size."""
+    means, log_scales = gaussians.means, getattr(gaussians, "log_scales", None)
+    if means.dtype != np.float64 or log_scales is None or not len(means):
+        return False
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = np.abs(means - means.astype(np.float32)).max(axis=1)  # [N]
+        return bool(np.median(moved / np.exp(log_scales.max(axis=1).astype(np.float64))) > PRECISION)
 
 
 def _further_properties(name: str, field: NDArray) -> tuple[tuple[str, ...], NDArray]:
@@ -188,8 +219,9 @@ def load_points(path: str | Path) -> PointCloud:
     Parameters
     ----------
     path : str or Path
-        The file, with the properties ``x``, ``y``, ``z`` and, for colours, ``red``, ``green``, ``blue``: integers from
-        0 to 255 or floats from 0 to 1. Everything else is ignored.
+        The file, with the properties ``x``, ``y``, ``z`` and, for colours, ``red``, ``green``, ``blue`` or one of the
+        other triples of ``COLOR_NAMES``: integers from 0 to 255, floats from 0 to 1, or coefficients ``f_dc_0`` to
+        ``f_dc_2`` of Gaussians. Everything else is ignored.
 
     Returns
     -------
@@ -205,21 +237,35 @@ def load_points(path: str | Path) -> PointCloud:
     missing = [name for name in MEANS if name not in columns]
     if missing:
         raise InputError(f"{path}: not a point cloud, it has no property {', '.join(missing)}")
-    has_colors = all(name in columns for name in COLORS)
-    used = np.stack([columns[name] for name in (*MEANS, *COLORS[: 3 * has_colors])], axis=1, dtype=np.float64)
-    with np.errstate(over="ignore"):
+    names = color_names(columns)
+    with np.errstate(over="ignore", invalid="ignore"):  # the latter of a signalling NaN
+        used = np.stack([columns[name] for name in (*MEANS, *(names or ()))], axis=1, dtype=np.float64)
         is_finite = np.isfinite(used.astype(np.float32)).all(axis=1)  # [P]
     used = used[is_finite]  # [P, 3 or 6]
     points = np.ascontiguousarray(used[:, :3])
-    colors = _as_bytes(path, columns, used[:, 3:]) if has_colors else np.full(points.shape, GRAY, np.uint8)
-    return PointCloud(points, colors, has_colors, int(np.count_nonzero(~is_finite)))
+    if names is None:
+        colors = np.full(points.shape, GRAY, np.uint8)
+    elif names == SH_DC:
+        colors = np.rint(255.0 * np.clip(0.5 + SH_C0 * used[:, 3:], 0.0, 1.0)).astype(np.uint8)
+    else:
+        colors = _as_bytes(path, columns, names, used[:, 3:])
+    return PointCloud(points, colors, names is not None, int(np.count_nonzero(~is_finite)))
 
 
-def _as_bytes(path: str | Path, columns: Mapping[str, NDArray], colors: Floats) -> NDArray[np.uint8]:
+def color_names(names: Collection[str]) -> tuple[str, str, str] | None:
+    """Return which of a cloud's properties are its colours: the three as any program calls them; None without."""
+    known = {name.casefold(): name for name in names}
+    found = (tuple(known.get(name) for name in group) for group in COLOR_NAMES)
+    return next(((r, g, b) for r, g, b in found if r is not None and g is not None and b is not None), None)
+
+
+def _as_bytes(
+    path: str | Path, columns: Mapping[str, NDArray], names: Sequence[str], colors: Floats
+) -> NDArray[np.uint8]:
     """Return colours [P, 3] as bytes, converted by the type that each has in the file."""
-    is_float = [columns[name].dtype.kind == "f" for name in COLORS]
+    is_float = [columns[name].dtype.kind == "f" for name in names]
     levels = np.rint(colors * np.where(is_float, 255.0, 1.0))  # [P, 3]
-    for name, column, values, floats in zip(COLORS, levels.T, colors.T, is_float, strict=True):
+    for name, column, values, floats in zip(names, levels.T, colors.T, is_float, strict=True):
         is_bad = (column < 0) | (column > 255)
         if is_bad.any():
             raise InputError(
@@ -259,6 +305,8 @@ def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
     n_faces = n_rows_of(path, "face")
     if n_faces:
         return f"it is a mesh of {n_faces:,} faces, which is not rendered: give a trained point_cloud.ply"
+    if "opacity" in columns or any(name in columns for name in (*SCALES, *QUATS)):
+        return "export it again with all properties of Gaussians (colours may also be red, green, blue)"
     if all(name in columns for name in MEANS):
         return "it is a point cloud: give it as a scene's points, or give a trained point_cloud.ply"
     return "give a trained point_cloud.ply"

@@ -5,6 +5,7 @@ detected here. All photographs are kept in memory as uint8 if they take a modera
 only sizes are checked here, and pixels are read on demand (:mod:`minisplat_ref.io.stored_views`).
 """
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from minisplat_ref import memory
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.empty_masks import TRAIN_VIEWS_MIN, MaskFiles, find_empty, report_empty
 from minisplat_ref.io.images import (
     MASK_THRESHOLD,
     check_n_pixels,
@@ -24,6 +26,7 @@ from minisplat_ref.io.images import (
     downscaled_size,
     image_size,
     is_turned,
+    mask_areas,
     read_image,
     read_mask,
     resize_image,
@@ -36,6 +39,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 COORDINATE_MAX = 1e18  # world units or pixels; the square of more would overflow float32
+DARK = 64  # of 255: a scene whose brightest pixel is below is stored in the wrong range; 14 bits of 16 reach 63
 SILENT_SECONDS = 2.0  # before reading photographs shows a progress bar
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
 
@@ -131,19 +135,17 @@ def build_scene(
     InputError
         If there are too few views, a camera is not usable, or an image is missing or does not fit its camera.
     """
-    if len(train_photos) < 2:
-        raise InputError(
-            f"{source}: {len(train_photos)} training and {len(test_photos)} test view(s), training needs at least 2;"
-            " add photographs or hold out fewer"
-        )
     photos = (*train_photos, *test_photos)
+    if len(train_photos) < TRAIN_VIEWS_MIN:
+        raise InputError(
+            f"{source}: {len(train_photos)} training and {len(test_photos)} test view(s), training needs at least"
+            f" {TRAIN_VIEWS_MIN}; add photographs or hold out fewer"
+        )
     for photo in photos:
         check_photo(photo, source, reading.undistort)
     _check_points(points, source)
     memory.check_photograph(source, max(_n_pixels(photo) for photo in photos), reading.downscale)
-    extent = camera_extent([photo.camera for photo in train_photos])
-    if extent == 0.0:
-        raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
+    _check_places(source, [photo.camera for photo in train_photos])
     names = _view_names(photos, source)
     shelf_bytes = memory.shelf_bytes(sum(map(_n_bytes, photos)) / reading.downscale**2)
     if shelf_bytes is None:
@@ -151,16 +153,43 @@ def build_scene(
     else:
         shelf = Shelf(shelf_bytes)
         views = tuple(make_stored_view(photo, name, reading, shelf) for photo, name in _show_progress(photos, names))
+    files = [MaskFiles(_path(photo, reading), photo.mask_path, reading.alpha_is_mask) for photo in photos]
+    empty = find_empty(views, files)
+    report_empty(source, views, files, empty, len(train_photos))
+    train_views = [view for i, view in enumerate(views[: len(train_photos)]) if i not in empty]
+    test_views = tuple(view for i, view in enumerate(views) if i >= len(train_photos) and i not in empty)
+    cameras = [view.camera for view in train_views]
+    _check_places(source, cameras)
+    _warn_of_darkness(source, views)
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
-        train_views=number_views(views[: len(train_photos)]),
-        test_views=views[len(train_photos) :],
+        train_views=number_views(train_views),
+        test_views=test_views,
         points=points,
         point_colors=point_colors,
         background=reading.background,
-        extent=extent,
+        extent=camera_extent(cameras),
     )
+
+
+def _check_places(source: Path, cameras: Sequence[Camera]) -> None:
+    """Refuse training cameras that all stand at one point."""
+    if camera_extent(cameras) == 0.0:
+        raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
+
+
+def _warn_of_darkness(source: Path, views: Sequence[View]) -> None:
+    """Warn of photographs in memory that are all almost black: usually of 10 to 14 bits in files of 16."""
+    if any(isinstance(view, StoredView) for view in views):
+        return
+    brightest = max(view.image.max() for view in views)
+    if brightest < DARK:
+        message = (
+            f"{source}: the photographs are almost black, the brightest value is {brightest} of 255; if files of"
+            " 16 bits hold fewer, scale the values so that white is 65535"
+        )
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
 
 
 def _show_progress(photos: Sequence[Photo], names: Sequence[str]) -> Iterable[tuple[Photo, str]]:
@@ -290,12 +319,15 @@ def _signature(photo: Photo, reading: Reading) -> list[tuple[int, int] | None]:
 
 
 def half_size(view: View) -> View:
-    """Return the view at half the width and height, rounded, with matching intrinsics."""
+    """Return the view at half the width and height, rounded, with matching intrinsics.
+
+    Of a mask so fine that no pixel would be left, the pixels stay of which most is white.
+    """
     width, height = downscaled_size(view.camera.width, view.camera.height, 2)
     camera = rescale_camera(view.camera, width, height)
     if isinstance(view, StoredView):
-        return view.change(partial(_resize, width=width, height=height))._replace(camera=camera)
-    image, mask = _resize(Pixels(view.image, view.mask), width, height)
+        return view.change(partial(_halve, width=width, height=height))._replace(camera=camera)
+    image, mask = _halve(Pixels(view.image, view.mask), width, height)
     return view._replace(camera=camera, image=image, mask=mask)
 
 
@@ -305,6 +337,15 @@ def _resize(pixels: Pixels, width: int, height: int) -> Pixels:
     if image.shape[:2] == (height, width):
         return pixels
     return Pixels(resize_image(image, width, height), None if mask is None else resize_mask(mask, width, height))
+
+
+def _halve(pixels: Pixels, width: int, height: int) -> Pixels:
+    """Return a photograph and its mask at half their size; of the mask something is left."""
+    halved = _resize(pixels, width, height)
+    if pixels.mask is None or halved.mask is None or halved.mask.any() or not pixels.mask.any():
+        return halved
+    areas = mask_areas(pixels.mask, width, height)
+    return halved._replace(mask=areas == areas.max())
 
 
 def rescale_camera(camera: Camera, width: int, height: int) -> Camera:

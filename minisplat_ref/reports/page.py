@@ -36,6 +36,9 @@ def page(title: str, introduction: str, parts: Iterable[str]) -> str:
     parts : iterable of str
         HTML: what the functions below return.
     """
+    # Names of files that are not text in the file system's encoding cannot be written; they are shown with escapes.
+    parts = [part.encode("utf-8", "backslashreplace").decode() for part in parts]
+    title, introduction = (text.encode("utf-8", "backslashreplace").decode() for text in (title, introduction))
     newline = "\n"  # an expression in an f-string holds no backslash before Python 3.12
     return f"""<!DOCTYPE html>
 <html lang="en">

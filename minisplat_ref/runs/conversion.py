@@ -14,11 +14,12 @@ import numpy as np
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, load_extension, owner_of
 from minisplat_ref.io.formats import Format, read_content
-from minisplat_ref.io.ply import further_properties
+from minisplat_ref.io.frames import frame_of_means, place_scene
+from minisplat_ref.io.ply import are_far, further_properties
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
-from minisplat_ref.types import Gaussians, Model, number_views
+from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, number_views
 
 VIEWS_MAX = 24
 NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
@@ -28,10 +29,13 @@ class Source(NamedTuple):
     """A model, and where it comes from."""
 
     model: Model
+    """In the frame of its scene's files."""
     owner: Extension
     """Whose population it is."""
     what: str
     """In a few words."""
+    frame: Frame = FILE_FRAME
+    """The frame in which it is rendered."""
 
 
 class Choice(NamedTuple):
@@ -93,30 +97,33 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     if owner is CORE and find_format(path) is None and (further := further_properties(path)):
         message = f"{path} also has {', '.join(further)}, which are left out: --extension E says what they belong to"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
-    return Source(model, owner, path.name)
+    return Source(model, owner, path.name, frame_of_means(model.gaussians.means))
 
 
 def _of_run(folder: Path) -> Source:
     from minisplat_ref.runs.checkpoints import newest_model
-    from minisplat_ref.runs.settings import load
+    from minisplat_ref.runs.settings import load, load_frame, return_model
 
     settings = load(folder)
     saved = newest_model(folder, settings)
     what = "the run's result" if saved.unfinished is None else f"iteration {saved.unfinished}"
-    return Source(saved.model, owner_of(settings.recipe, settings.extension) or CORE, what)
+    owner, frame = owner_of(settings.recipe, settings.extension) or CORE, load_frame(folder)
+    return Source(return_model(saved.model, owner, frame), owner, what, frame)
 
 
 def _of_checkpoint(path: Path) -> Source:
     """Read a checkpoint without its run: the population is that of its recipe, which an extension may own."""
     from minisplat_ref.io.checkpoint import load_checkpoint
-    from minisplat_ref.training.saved_state import read_bundles, read_counters, written_by
+    from minisplat_ref.runs.settings import return_model
+    from minisplat_ref.training.saved_state import read_bundles, read_counters, read_frame, written_by
 
     arrays, metadata = load_checkpoint(path)
     step = read_counters(path, metadata).step
     fields = {name.removeprefix("gaussians.") for name in arrays if name.startswith("gaussians.")}
     owner = CORE if fields == set(Gaussians._fields) else owner_of(written_by(metadata)[0]) or CORE
     bundles = read_bundles(path, arrays, owner.representation.population)
-    return Source(Model(bundles.gaussians, bundles.shared), owner, f"iteration {step}")
+    model, frame = Model(bundles.gaussians, bundles.shared), read_frame(path, metadata)
+    return Source(return_model(model, owner, frame), owner, f"iteration {step}", frame)
 
 
 def choose_format(path: Path) -> Format | None:
@@ -147,6 +154,26 @@ def check_population(population: Any, format_: Format, what: str) -> None:
         raise InputError(
             f"{what} has {', '.join(further)}, which {format_.suffix} does not hold: convert it to a PLY, which does"
         )
+
+
+def encode_as(format_: Format, path: Path, gaussians: Gaussians, level: int) -> bytes:
+    """Return the content of a file at one level; an error names the file.
+
+    Raises
+    ------
+    InputError
+        A value does not fit the format.
+    """
+    if are_far(gaussians):
+        distance = float(np.abs(np.median(gaussians.means, axis=0)).max())
+        raise InputError(
+            f"{path} cannot be written: its centres are some {distance:.6g} from the origin, where float32 has steps of"
+            f" {np.spacing(np.float32(distance)):.2g}; write a PLY, which holds them in float64"
+        )
+    try:
+        return format_.encode(gaussians, level)
+    except InputError as error:
+        raise InputError(f"{path} cannot be written: {error}") from None
 
 
 def finest_within(gaussians: Gaussians, format_: Format, max_bytes: int) -> Choice:
@@ -234,7 +261,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     from minisplat_ref.io import load_scene
     from minisplat_ref.metrics import evaluate
     from minisplat_ref.runs.scoring import renderer_of
-    from minisplat_ref.runs.settings import load, load_photographs
+    from minisplat_ref.runs.settings import load, load_photographs, place_model
 
     profile, backend = GSPLAT_MAIN.name, "cpu"
     renderer = with_sky(with_compensation(source.owner.representation.renderer))
@@ -244,14 +271,15 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
             settings._replace(
                 scene=settings.scene if scene is None else str(scene),
                 downscale=settings.downscale if downscale is None else downscale,
-            )
+            ),
+            source.frame,
         )
         profile, backend = settings.profile, settings.backend
         if scene is None:  # its own photographs, for which it may have exposures and poses
             renderer = renderer_of(settings, source.model)
             photographs = photographs._replace(train_views=number_views(photographs.train_views))
     elif scene is not None:
-        photographs = load_scene(scene, downscale=downscale or 1, undistort=True)
+        photographs = place_scene(load_scene(scene, downscale=downscale or 1, undistort=True), source.frame)
     else:
         raise InputError(f"--max-drop needs photographs to measure on, and {path} is no run: give --scene PATH")
     n = len(photographs.train_views)
@@ -260,7 +288,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
 
     def psnr_of(gaussians: Gaussians) -> float:
         psnr = evaluate(
-            source.model._replace(gaussians=gaussians),
+            place_model(source.model._replace(gaussians=gaussians), source.owner, source.frame),
             views,
             RenderSettings(
                 photographs.background, renderer=renderer, backend=get_backend(backend), conventions=PROFILES[profile]

@@ -16,8 +16,8 @@ from minisplat_ref.runs.conversion import read_population
 from minisplat_ref.runs.first_use import warn_if_not_kept
 from minisplat_ref.runs.notices import warn_of_model
 from minisplat_ref.runs.scoring import score, to_metrics
-from minisplat_ref.runs.settings import Settings, load, load_lpips, load_photographs
-from minisplat_ref.types import Scene
+from minisplat_ref.runs.settings import Settings, load, load_frame, load_lpips, load_photographs, place_model
+from minisplat_ref.types import Model, Scene
 
 
 class Measured(NamedTuple):
@@ -66,13 +66,14 @@ def evaluate_run(
         test_every=settings.test_every if test_every is None else test_every,
         lpips_weights=settings.lpips_weights if lpips_weights is None else str(lpips_weights),
     )
-    saved = newest_model(folder, settings)
+    saved, frame = newest_model(folder, settings), load_frame(folder)
     if model is not None:
         owner = owner_of(settings.recipe, settings.extension) or CORE
-        saved = Saved(saved.model._replace(gaussians=read_population(model, owner)), None)
+        given = place_model(Model(read_population(model, owner)), owner, frame)
+        saved = Saved(saved.model._replace(gaussians=given.gaussians), None)
     warn_of_model(saved.model, folder)
     warn_if_not_kept(settings.backend)
-    photographs = load_photographs(asked)
+    photographs = load_photographs(asked, frame)
     if not photographs.test_views:
         raise InputError(f"{asked.scene} has no test views: give --test-every above 0")
     network = load_lpips(asked, photographs)

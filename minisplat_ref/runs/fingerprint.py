@@ -22,6 +22,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io import viewpoints
+from minisplat_ref.io.frames import return_camera
 from minisplat_ref.io.stored_views import Photograph, StoredView
 from minisplat_ref.runs.run_folder import CAMERAS
 from minisplat_ref.types import Scene, View
@@ -34,9 +35,10 @@ Entries = Sequence[Mapping[str, Any]]
 
 
 def of_scene(scene: Scene) -> list[dict[str, Any]]:
-    """Return what ``cameras.json`` holds: every view with its camera and the hash of its photograph."""
+    """Return what ``cameras.json`` holds: every view with its camera, as in the files, and its photograph's hash."""
     views = (*scene.train_views, *scene.test_views)
-    cameras = viewpoints.to_json(viewpoints.scene_viewpoints(scene))
+    found = viewpoints.scene_viewpoints(scene)
+    cameras = viewpoints.to_json([v._replace(camera=return_camera(v.camera, scene.frame)) for v in found])
     return [{**camera, PHOTOGRAPH: _hash(view)} for camera, view in zip(cameras, views, strict=True)]
 
 

@@ -7,10 +7,13 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.io.frames import describe_frame
+from minisplat_ref.io.inventory import take_inventory
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
-from minisplat_ref.types import Model, Scene
+from minisplat_ref.types import FILE_FRAME, Model, Scene
 
 N_SIZES = 3  # of photographs that are all named
 FEW_POINTS = 20  # sparse points that say little about a scene
@@ -46,6 +49,28 @@ def warn_of_scene(scene: Scene, downscale: int, *, is_dense: bool = False) -> No
             f"photographs of scene {scene.name} are {width} x {height} pixels{cause}; from fewer than {SIDE_MIN} x"
             f" {SIDE_MIN} hardly any structure can be learned, and measures of them say little"
         )
+
+
+def report_inventory(path: Path, scene: Scene, model: str | None) -> None:
+    """Say how many photographs of a scene's folder have cameras; warn of what else is there and not used."""
+    inventory = take_inventory(path, scene, model)
+    if inventory.unused:
+        _warn(f"{path}: {inventory.line}")
+    else:
+        print(f"{scene.name}: {inventory.line}")
+
+
+def describe_place(scene: Scene) -> str:
+    """Say that a scene is trained in another frame than that of its files; nothing where it is not."""
+    if scene.frame == FILE_FRAME:
+        return ""
+    extent = scene.frame.unit * scene.extent
+    distance = math.hypot(*scene.frame.origin)
+    far = f", {distance:.4g} from the origin" if distance else ""
+    return (
+        f"scene {scene.name} is {extent:.4g} units large{far}: while it is trained it is {describe_frame(scene.frame)};"
+        " files keep its coordinates"
+    )
 
 
 def describe_sizes(sizes: Sequence[tuple[int, int]]) -> str:

@@ -11,7 +11,7 @@ from minisplat_ref.extensions.extension import CORE, Extension, owner_of
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.checkpoints import newest_model
-from minisplat_ref.runs.settings import Settings, load, load_photographs, recipe_of
+from minisplat_ref.runs.settings import Settings, load, load_frame, load_photographs, recipe_of
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.types import Model, Scene, number_views
@@ -85,7 +85,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     settings = settings if scene is None else settings._replace(scene=str(scene.resolve()))
     if not Path(settings.scene).exists():
         raise InputError(f"{settings.scene}, the scene of {folder}, is not there: --scene PATH says where it is now")
-    photographs = load_photographs(settings)
+    photographs = load_photographs(settings, load_frame(folder))
     fingerprint.check(folder, photographs, settings.scene)
     check_views(photographs, "simplify")
     if n_rows(saved.model.gaussians) < 2:

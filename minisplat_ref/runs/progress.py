@@ -95,6 +95,7 @@ class Progress(AbstractContextManager["Progress"]):
         self._bar.total = report.last_step  # None while the recipe has not decided it
         if self._bar.n == self._first_step:
             self._bar.set_description_str("training", refresh=False)
+            self._estimate_from_now()
         self._bar.update()
         for note in report.notes:
             self._bar.write(f"minisplat-ref: {note}", file=sys.stderr)
@@ -125,12 +126,19 @@ class Progress(AbstractContextManager["Progress"]):
         self._bar.set_postfix_str(line, refresh=False)
         self._losses.clear()
 
+    def _estimate_from_now(self) -> None:
+        """Leave the first iteration out of the bar's estimate: most of its time is compilation."""
+        self._bar.start_t = self._bar.last_print_t = time.time()
+        self._bar.initial = self._bar.last_print_n = self._bar.n + 1
+
     def _min_rest(self, report: StepReport) -> str:
         """Say how long a training that has not decided its length continues at least: as if it began to cool now."""
         if self._cooling is None or report.last_step is not None:
             return ""
         bar = self._bar.format_dict
         rate = bar["rate"] or (bar["n"] - bar["initial"]) / bar["elapsed"]  # the first is of the last few iterations
+        if rate <= 0:
+            return ""
         return f", at least {tqdm.format_interval(self._cooling.part * report.step / rate)} to go"
 
 

@@ -203,7 +203,7 @@ def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -
         with Interruptions() as interruptions:
             interruptions.defer()
             checkpoints.save(folder, state, recipe)
-            save_model(folder, settings, state.model)
+            save_model(folder, settings, state.model, state.frame)
             if recipe.cooling is not None:
                 run_folder.write_json(folder / run_folder.DECISIONS, to_metadata(state.pace))
     except KeyboardInterrupt:

@@ -13,20 +13,33 @@ from minisplat_ref import __version__
 from minisplat_ref.backends import BACKENDS
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
+from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.frames import (
+    Unit,
+    frame_from_json,
+    frame_to_json,
+    place_fields,
+    place_population,
+    place_scene,
+    return_fields,
+    return_population,
+)
 from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
+from minisplat_ref.io.ply import save_ply
 from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.strategy import importance, simplify
+from minisplat_ref.training.calibration import SHIFTS
 from minisplat_ref.training.schedule import Recipe, configure, describe, parse_settings, settings_of
-from minisplat_ref.types import Floats, Model, Scene
+from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
+SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
 
 
@@ -77,6 +90,8 @@ class Settings(NamedTuple):
     """Size that the PLY of a simplification after the training may have; None: there is none."""
     init: str | None = None
     """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
+    model: str | None = None
+    """Folder of the COLMAP model, relative to the scene; None for the first that is there."""
     background: list | None = None
     """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
 
@@ -113,17 +128,49 @@ def _choose(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
     return None if key is None else choices[key]
 
 
-def save_model(folder: Path, settings: Settings, model: Model) -> None:
-    """Write the population, and the shared parameters if there are any, into the folder of a run."""
+def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> None:
+    """Write the population, and the shared parameters if there are any, into the folder of a run.
+
+    Parameters
+    ----------
+    folder : Path
+    settings : Settings
+        Of the run.
+    model : Model
+        In its frame; the files are in that of the scene's files.
+    frame : Frame
+        That of the run's scene.
+    """
     owner = owner_of(settings.recipe, settings.extension) or CORE
+    model = return_model(model, owner, frame)
     owner.save(folder / POINT_CLOUD, model.gaussians)
     if model.shared:
         with replacing(folder / SHARED) as temporary, open(temporary, "wb") as file:
             np.savez(file, allow_pickle=False, **model.shared)
 
 
+def place_model(model: Model, owner: Extension, frame: Frame) -> Model:
+    """Return a model of files in the frame of a run."""
+    if frame == FILE_FRAME:
+        return model
+    return Model(
+        place_population(model.gaussians, owner.representation.units, frame),
+        place_fields(model.shared, SHARED_UNITS, frame),
+    )
+
+
+def return_model(model: Model, owner: Extension, frame: Frame) -> Model:
+    """Return a model of a run in the frame of its scene's files."""
+    if frame == FILE_FRAME:
+        return model
+    return Model(
+        return_population(model.gaussians, owner.representation.units, frame),
+        return_fields(model.shared, SHARED_UNITS, frame),
+    )
+
+
 def load_model(folder: Path, settings: Settings) -> Model:
-    """Read what :func:`save_model` wrote.
+    """Read what :func:`save_model` wrote, into the frame of the run.
 
     Raises
     ------
@@ -132,9 +179,8 @@ def load_model(folder: Path, settings: Settings) -> Model:
     """
     owner = owner_of(settings.recipe, settings.extension) or CORE
     gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
-    if not (folder / SHARED).exists():
-        return Model(gaussians)
-    return Model(gaussians, read_npz(folder / SHARED, "train again"))
+    shared = read_npz(folder / SHARED, "train again") if (folder / SHARED).exists() else NOTHING
+    return place_model(Model(gaussians, shared), owner, load_frame(folder))
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
@@ -143,6 +189,7 @@ def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any
     return {
         "settings": settings._asdict(),
         "background": scene.background.tolist(),
+        **({} if scene.frame == FILE_FRAME else {"frame": frame_to_json(scene.frame)}),
         "recipe": describe(recipe),
         "versions": {"minisplat_ref": __version__, "python": platform.python_version(), **versions},
         "platform": platform.platform(),
@@ -194,6 +241,20 @@ def load_background(folder: Path) -> Floats:
     return background
 
 
+def load_frame(folder: Path) -> Frame:
+    """Read the frame in which a run is trained, measured and rendered.
+
+    Raises
+    ------
+    InputError
+        As for :func:`load`.
+    """
+    frame = frame_from_json(_read_config(folder).get("frame"))
+    if frame is None:
+        raise InputError(f"{folder / CONFIG} has a frame without an origin of three numbers and a unit above 0")
+    return frame
+
+
 def _read_config(folder: Path) -> dict[str, Any]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: give the --out folder of a training")
@@ -202,21 +263,46 @@ def _read_config(folder: Path) -> dict[str, Any]:
     return read_json_object(folder / CONFIG)
 
 
-def load_photographs(settings: Settings) -> Scene:
+def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
     """Load the scene of a run as it was loaded for the training.
+
+    Parameters
+    ----------
+    settings : Settings
+    frame : Frame, optional
+        That of the run; by default the one that suits the scene.
 
     Raises
     ------
     InputError
         See :func:`minisplat_ref.io.load_scene`.
     """
-    return load_scene(
+    scene = load_scene(
         settings.scene,
         downscale=settings.downscale,
         test_every=settings.test_every,
         background=settings.background,
         undistort=settings.undistort,
+        model=settings.model,
     )
+    return place_scene(scene, frame)
+
+
+def check_frame(settings: Settings, scene: Scene) -> None:
+    """Refuse a scene far from the origin for an extension whose own files hold float32 alone.
+
+    Raises
+    ------
+    InputError
+        Says how far it is.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    if any(scene.frame.origin) and owner.save is not save_ply:
+        distance = float(np.linalg.norm(scene.frame.origin))
+        raise InputError(
+            f"{settings.scene} is {distance:.4g} from the origin, where files of extension {owner.name}, of float32,"
+            " cannot place it: subtract the mean of the cameras' positions from cameras and points"
+        )
 
 
 def load_lpips(settings: Settings, scene: Scene) -> Network | None:

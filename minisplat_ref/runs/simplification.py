@@ -34,6 +34,7 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE
+from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import ViewMetrics, evaluate
 from minisplat_ref.runs.opened_run import Run, check_renderer, check_views
 from minisplat_ref.runs.rate_distortion import PlySize, Point, next_size, paired_drop, smallest_within
@@ -100,7 +101,8 @@ def ply_size(run: Run) -> PlySize:
     with tempfile.TemporaryDirectory() as folder:
         for n in (1, 2):
             path = Path(folder, f"{n}.ply")
-            run.owner.save(path, take(run.model.gaussians, np.arange(n)))
+            rows, units = take(run.model.gaussians, np.arange(n)), run.owner.representation.units
+            run.owner.save(path, return_population(rows, units, run.scene.frame))
             n_bytes.append(path.stat().st_size)
     row = n_bytes[1] - n_bytes[0]
     return PlySize(n_bytes[0] - row - 1, row)
@@ -202,6 +204,7 @@ def fine_tune(run: Run, gaussians: Any, iterations: int, *, views: Sequence[int]
         shared=shared,
         shared_adam=zero_moments(shared),
         pace=pace,
+        frame=run.scene.frame,
     )
     return train(
         run.scene,

@@ -55,7 +55,7 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
         decision = decide(run, asked.target, measuring(run, asked.fine_tune))
         is_unchanged, n = decision.is_unchanged, decision.chosen.n_gaussians
         model = run.model if is_unchanged else finish(run, n, asked.fine_tune)
-        save_model(folder, run.settings, model)
+        save_model(folder, run.settings, model, run.scene.frame)
         after = score(folder, run.scene, model, run.settings)
         before = after if is_unchanged else measure(run.scene, run.model, run.settings)
         result = {**to_result(run, asked, decision), "test": of_test_views(before, after)}

@@ -3,7 +3,9 @@
 from pathlib import Path
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.ply import load_points
+from minisplat_ref.io.frames import place_points
+from minisplat_ref.io.ply import MEANS, NORMALS, load_points
+from minisplat_ref.io.ply_file import property_names
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, are_seen
 from minisplat_ref.types import Scene
 
@@ -16,7 +18,7 @@ def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
     Parameters
     ----------
     path : str or Path
-        A PLY, in the scene's world frame; see :func:`minisplat_ref.io.ply.load_points`.
+        A PLY, in the frame of the scene's files; see :func:`minisplat_ref.io.ply.load_points`.
     scene : Scene
 
     Returns
@@ -32,6 +34,7 @@ def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
         The file is missing or not a point cloud, has too few points, or no training view sees any of them.
     """
     cloud = load_points(path)
+    cloud = cloud._replace(points=place_points(cloud.points, scene.frame))
     n = len(cloud.points)
     if n <= N_NEIGHBOURS:
         raise InputError(
@@ -44,5 +47,8 @@ def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
         )
     notices = [f"{path}: {cloud.dropped} and left out"] if cloud.dropped else []
     if not cloud.has_colors:
-        notices.append(f"{path}: no properties red, green, blue; all points start gray")
+        others = ", ".join(name for name in property_names(path) if name not in (*MEANS, *NORMALS))
+        notices.append(
+            f"{path}: no properties red, green, blue{f', but {others}' if others else ''}; all points start gray"
+        )
     return scene._replace(points=cloud.points, point_colors=cloud.colors), notices

@@ -52,6 +52,7 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         stats={},
         shared=shared,
         shared_adam=zero_moments(shared),
+        frame=scene.frame,
     )
 
 
@@ -67,6 +68,11 @@ def _with_dense_points(scene: Scene, budget: int | None) -> Scene:
 def check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
     """Refuse a state of another scene: its views, and its arrays with a row per view, must match the scene's."""
     n_views = len(scene.train_views)
+    if state.frame != scene.frame:
+        raise InputError(
+            f"scene {scene.name} is in another frame than the run to continue: place it in that of the run"
+            " (io.frames.place_scene)"
+        )
     if max(state.view_order, default=0) >= n_views:
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
     expected = {name: a.shape for c in recipe.active_calibrations for name, a in c.initial(n_views).items()}

@@ -3,10 +3,14 @@
 What happens in one of them is in :mod:`minisplat_ref.training.iteration`.
 """
 
+import math
+import warnings
 from collections.abc import Callable
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.io.frames import choose_frame
 from minisplat_ref.io.stored_views import ReadingAhead
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.ops import n_rows
@@ -18,7 +22,7 @@ from minisplat_ref.training.pace import COOLED, Decision
 from minisplat_ref.training.schedule import Recipe, as_decided
 from minisplat_ref.training.smaller_views import ViewSizes
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
-from minisplat_ref.types import Scene, number_views
+from minisplat_ref.types import FILE_FRAME, Scene, number_views
 
 
 def train(
@@ -68,6 +72,7 @@ def train(
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=number_views(scene.train_views))
+    _warn_of_frame(scene)
     check_fits(state, scene, as_decided(recipe, state.pace))
     sizes, switched_on = ViewSizes(recipe, scene), None
     with ReadingAhead() as ahead, Interruptions() as interruptions:
@@ -84,6 +89,17 @@ def train(
             del report  # frees its image before the next is made
             interruptions.release()
     return state
+
+
+def _warn_of_frame(scene: Scene) -> None:
+    """Warn of a scene that should have been moved or scaled: float32 or the near plane will spoil it."""
+    frame = choose_frame([view.camera for view in scene.train_views], scene.extent)
+    if scene.frame == FILE_FRAME and frame != FILE_FRAME:
+        message = (
+            f"scene {scene.name} is {scene.extent:.4g} units large and {math.hypot(*frame.origin):.4g} from the origin,"
+            " for which neither float32 nor the near plane is made: train io.frames.place_scene(scene)"
+        )
+        warnings.warn(one_line(message), InputWarning, stacklevel=3)
 
 
 def _complete(report: StepReport, recipe: Recipe, sizes: ViewSizes) -> StepReport:

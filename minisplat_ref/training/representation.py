@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref.io.frames import Unit, Units
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.types import NOTHING, Floats, Gaussians, Scene
@@ -23,6 +24,10 @@ def nothing_shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Float
     return NOTHING
 
 
+WORLD_UNITS: Units = {"means": Unit.PLACE, "log_scales": Unit.LOG_LENGTH}
+"""The fields of 3DGS that are in world units."""
+
+
 class Representation(NamedTuple):
     """What is trained to represent a scene."""
 
@@ -36,6 +41,8 @@ class Representation(NamedTuple):
     renderer: Renderer = SPLATTING
     rates: Rates = Rates({}, frozenset())
     """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
+    units: Units = WORLD_UNITS
+    """What of the population is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
 
 
 GAUSSIANS = Representation("gaussians")

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
+from minisplat_ref.io.frames import frame_from_json, frame_to_json
 from minisplat_ref.training.adam import AdamState, fields_of
 from minisplat_ref.training.calibration import CALIBRATIONS
 from minisplat_ref.training.pace import Pace, from_metadata, to_metadata
 from minisplat_ref.training.rates import n_coefficients
 from minisplat_ref.training.schedule import Recipe, as_decided, describe
 from minisplat_ref.training.state import DEGREES, TrainState
-from minisplat_ref.types import Floats, Gaussians
+from minisplat_ref.types import FILE_FRAME, Floats, Frame, Gaussians
 
 WAY_OUT = "give another checkpoint or train again"
 N_STATE_BITS = 128  # of the generator PCG64
@@ -84,6 +85,8 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
     }
     if recipe.cooling is not None:
         metadata["pace"] = to_metadata(state.pace)
+    if state.frame != FILE_FRAME:
+        metadata["frame"] = frame_to_json(state.frame)
     save_checkpoint(path, arrays, metadata, previous=previous)
 
 
@@ -118,6 +121,7 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
         bundles.shared,
         AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step),
         pace=pace,
+        frame=read_frame(path, metadata),
     )
 
 
@@ -127,6 +131,20 @@ def written_by(metadata: Mapping[str, Any]) -> tuple[str, str]:
     recipe = recipe if isinstance(recipe, dict) else {}
     n_iterations = recipe.get("iterations")
     return str(recipe.get("name", "without a name")), f"{n_iterations:,}" if type(n_iterations) is int else "unknown"
+
+
+def read_frame(path: str | Path, metadata: Mapping[str, Any]) -> Frame:
+    """Return the frame of a checkpoint's parameters.
+
+    Raises
+    ------
+    DamagedCheckpoint
+        It is malformed.
+    """
+    frame = frame_from_json(metadata.get("frame"))
+    if frame is None:
+        raise DamagedCheckpoint(f"{path}: frame is no origin and unit; {WAY_OUT}")
+    return frame
 
 
 def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:

@@ -19,7 +19,7 @@ from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
 from minisplat_ref.training.adam import AdamState, zero_moments
 from minisplat_ref.training.pace import Cooling, Decision, Pace
 from minisplat_ref.training.representation import GAUSSIANS, Representation
-from minisplat_ref.types import Floats, Gaussians, Ints, Model, RenderOutput, Scene, View
+from minisplat_ref.types import FILE_FRAME, Floats, Frame, Gaussians, Ints, Model, RenderOutput, Scene, View
 
 DEGREES = "sh_degree"
 """Name of the statistic by which each Gaussian has a degree of the spherical harmonics for itself."""
@@ -51,6 +51,8 @@ class TrainState:
     """False while an iteration changes the state; if it stays so, the iteration failed halfway: do not save."""
     max_rows: float = math.inf
     """Rows that memory has room for, as far as is known."""
+    frame: Frame = FILE_FRAME
+    """That of the scene, in which the parameters are."""
 
     @property
     def model(self) -> Model:

@@ -127,7 +127,7 @@ def test_unsupported_camera_model_with_undistort(train_refused, tmp_path):
 
 def test_damaged_colmap_model(train_refused, tmp_path):
     scene = write_colmap(tmp_path / "scene")
-    (scene / "sparse" / "0" / "points3D.txt").unlink()
+    (scene / "sparse" / "0" / "images.txt").unlink()
     assert str(scene / "sparse" / "0") in train_refused(scene)
 
 

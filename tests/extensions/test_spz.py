@@ -103,12 +103,15 @@ def test_another_program_reads_our_spz(level, tmp_path):
     assert rotation_error(theirs.quats, back.quats).max() < SPZ_ROTATION
 
 
-def test_spz_reaches_2048():
+def test_spz_has_as_many_fractional_bits_as_reach_the_farthest():
     gaussians = population(3, 0)
-    gaussians.means[1] = [2047.99, 0, 0]
-    assert np.isfinite(spz.decode(spz.encode(gaussians, 0), "file").means).all()
-    gaussians.means[1] = [2048, 0, 0]
-    with pytest.raises(InputError, match=r"centre of row 1 is 2048 away, but SPZ reaches 2048 \(1 of 3 are too far\)"):
+    for distance, bits in ((2047.99, 12), (2048, 11), (4095.99, 11), (5000, 10)):
+        gaussians.means[1] = [distance, 0, 0]
+        assert spz_raw(gaussians)[13] == bits
+        means = spz.decode(spz.encode(gaussians, 0), "file").means
+        assert_allclose(means, gaussians.means, rtol=0, atol=2.0 ** (-bits - 1))
+    gaussians.means[1] = [1e6, 0, 0]
+    with pytest.raises(InputError, match=r"centre of row 1 is 1e\+06 away, where SPZ has steps of 0\.125"):
         spz.encode(gaussians, 0)
 
 
@@ -127,7 +130,7 @@ def spz_of(version=3, n=2**31 - 1, degree=3, bits=12, body=b""):
 def test_spz_that_claims_too_much():
     assert "2,147,483,647 Gaussians cannot be" in refusal(spz.SPZ, spz_of())
     assert "version 1" in refusal(spz.SPZ, spz_of(version=1))
-    assert "version 4" in refusal(spz.SPZ, struct.pack("<III", spz.MAGIC, 4, 1) + bytes(40))
+    assert "version 5" in refusal(spz.SPZ, struct.pack("<III", spz.MAGIC, 5, 1) + bytes(40))
     assert "degree 9" in refusal(spz.SPZ, spz_of(degree=9))
     assert "24 fractional bits" in refusal(spz.SPZ, spz_of(bits=24))
     assert "truncated, 211 bytes and their end expected, 46 found" in refusal(spz.SPZ, spz_of(n=3, body=bytes(30)))

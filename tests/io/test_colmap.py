@@ -290,8 +290,8 @@ BAD_SCENES = {
         {},
         r"no COLMAP model, looked for .* run `minisplat-ref sfm",
     ),
-    "no points": (
-        remove("sparse", "0", "points3D.txt"),
+    "no images": (
+        remove("sparse", "0", "images.txt"),
         {},
         r"sparse/0: damaged or incomplete COLMAP model .*; copy or",
     ),

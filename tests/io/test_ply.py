@@ -381,8 +381,8 @@ def test_zero_quaternion(tmp_path, rng):
 @pytest.mark.parametrize(
     ("drop", "message"),
     [
-        (["rot_3"], "no property rot_3; it is a point cloud"),
-        (["x", "opacity"], "no property x, opacity; give a trained"),
+        (["rot_3"], "no property rot_3; export it again with all properties"),
+        (["x", "opacity"], "no property x, opacity; export it again with all properties"),
         (["f_rest_44"], r"44 properties f_rest_\*, but spherical harmonics .* have 0, 9, 24 or 45"),
         ([f"f_rest_{i}" for i in range(36)], "no property f_rest_0, f_rest_1"),
     ],

@@ -58,6 +58,7 @@ def true_surface(folder: Path, scene: Scene) -> Surface | None:
         rescale_camera(view.camera, width=depth.shape[1], height=depth.shape[0])
         for view, depth in zip(scene.train_views, depths, strict=True)
     ]
+    depths = [depth / scene.frame.unit for depth in depths]
     return surface_near(unproject_views(cameras, depths), cameras, scene.extent)
 
 

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.antialiasing.reference import VARIANCE, smooth, smooth_vjp
+from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.sampling import sampling_intervals
 from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import At, Every
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
@@ -89,6 +90,7 @@ MIP = with_3d_filter(with_2d_filter(SPLATTING))
 FILTERED = Representation(
     "filtered Gaussians",
     population=FilteredGaussians,
+    units={**WORLD_UNITS, "filter_sigmas": Unit.LENGTH},
     extend=add_filters,
     renderer=MIP,
     rates=Rates({"filter_sigmas": 0.0}, frozenset()),

@@ -1,11 +1,11 @@
-"""``.spz``: Niantic's format, versions 2 and 3, read and written.
+"""``.spz``: Niantic's format, versions 2 to 4 read, 2 and 3 written.
 
-A file is a gzip stream. It holds a header of 16 bytes (magic, version, number N, degree of the spherical harmonics,
-fractional bits, flags) and then, each for all Gaussians, centres, opacities, colours, scales, rotations and higher
-harmonics.
+A file is a gzip stream, in version 4 a plain header and a zstandard frame for each part (:mod:`.spz_streams`). It holds
+a header of 16 bytes (magic, version, number N, degree of the spherical harmonics, fractional bits, flags) and then,
+each for all Gaussians, centres, opacities, colours, scales, rotations and higher harmonics.
 
 ===========  ==========================================================================================
-centres      3 x 24 bits, two's complement, in steps of ``2^-12`` (the fractional bits of the header)
+centres      3 x 24 bits, two's complement, in steps of ``2^-b``, for the b fractional bits of the header
 opacity      ``255 o``
 colour       ``255 (0.15 c + 0.5)`` of the coefficient c of degree 0, which is not its colour
 scales       ``16 (ln s + 10)``, 8 bits, so from e^-10 to e^5.94
@@ -14,8 +14,9 @@ rotation     version 2: x, y, z as ``127.5 (q + 1)`` with w >= 0; version 3: 2 b
 harmonics    ``128 c + 128``, to a multiple of 8 for degree 1 and of 16 above; RGB last
 ===========  ==========================================================================================
 
-Colours, scales and harmonics outside their ranges are clipped; centres outside are refused, since clipping would move
-them.
+Colours, scales and harmonics outside their ranges are clipped. Of the fractional bits we write 12, as Niantic does, so
+that centres reach 2048; fewer if one is further away, more if the Gaussians are so small that they would move by much
+of their size. What neither would hold is refused.
 
 **Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
 down, z forward). Niantic's library converts one to the other when its caller asks for it; we always do, in agreement
@@ -25,12 +26,13 @@ derives from their polynomials. PlayCanvas' splat-transform reads what we write 
 
 Opacities 0 and 1 have no logit. They are read as a quarter of a quantisation level away from the end.
 
-Left out are version 1 (half floats), version 4 (zstandard, extensions), and the flag that a scene was trained with
-antialiasing, which is ignored when read and written as 0.
+Left out are version 1 (half floats), harmonics of degree 4, which are dropped with a warning, records of vendors, and
+the flag that a scene was trained with antialiasing, which is ignored when read and written as 0.
 """
 
 import math
 import struct
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,21 +41,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref import memory
-from minisplat_ref.errors import InputError
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.extensions.compression import spz_streams
 from minisplat_ref.io.formats import Format
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
 MAGIC = 0x5053474E  # "NGSP"
 VERSIONS = (3, 2)  # as levels: the finest first
-FRACTIONAL_BITS = 12
-REACH = 2.0 ** (23 - FRACTIONAL_BITS)  # 2048
+FRACTIONAL_BITS, FRACTIONAL_BITS_MAX = 12, 23
+STEP_MAX = 0.1  # of the median of the largest scales; the step of 12 bits is about 0.02 of it in a usual scene
+LOG_SCALE_MIN = -10.0
+SMALLER_SHARE = 0.01  # of the Gaussians, from which on it is said that they are smaller than that
 COLOR_SCALE = 0.15
 SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
 GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
 HEADER = struct.Struct("<IIIBBBB")
 WAY_OUT = "copy or export the file again"
-BYTES_OF_REST = (0, 9, 24, 45)  # by degree
+BYTES_OF_REST = (0, 9, 24, 45, 72)  # by degree
 
 # Signs of the harmonics of degree 1 to 3 under (x, y, z) -> (x, -y, -z), by whether their polynomials are odd in y and
 # z together: y, z, x; xy, yz, 2zz-xx-yy, xz, xx-yy; y(3xx-yy), xyz, y(4zz-xx-yy), z(..), x(..), z(xx-yy), x(xx-3yy).
@@ -70,7 +76,7 @@ class _Header(NamedTuple):
     @property
     def sizes(self) -> dict[str, int]:
         """Bytes per Gaussian of each attribute, in the order of the file."""
-        rotation = 4 if self.version == 3 else 3
+        rotation = 3 if self.version == 2 else 4
         rest = BYTES_OF_REST[self.sh_degree]
         return {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": rotation, "sh_rest": rest}
 
@@ -93,14 +99,8 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
     means = gaussians.means.astype(np.float64) * _AXES
-    steps = np.floor(means * 2.0**FRACTIONAL_BITS + 0.5)  # [N, 3]
-    out = (steps < -(2**23)) | (steps >= 2**23)
-    if out.any():
-        row = int(np.flatnonzero(out.any(axis=1))[0])
-        raise InputError(
-            f"the centre of row {row} is {np.abs(means[row]).max():.6g} away, but SPZ reaches {REACH:g}"
-            f" ({int(out.any(axis=1).sum()):,} of {n:,} are too far): scale the scene down, or choose another format"
-        )
+    fractional_bits = _fractional_bits(means, gaussians.log_scales)
+    steps = np.floor(means * 2.0**fractional_bits + 0.5)  # [N, 3]
     opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
     quats = gaussians.quats.astype(np.float64) * np.concatenate([[1.0], _AXES])
     sh_rest = 128.0 * gaussians.sh_rest * SIGNS[:n_rest, None]  # [N, K-1, 3]
@@ -114,9 +114,47 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         _to_buckets(sh_rest),
     )
     sh_degree = math.isqrt(n_rest + 1) - 1
-    header = HEADER.pack(MAGIC, version, n, sh_degree, FRACTIONAL_BITS, 0, 0)
+    header = HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0)
     compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
     return compressor.compress(header + b"".join(part.tobytes() for part in parts)) + compressor.flush()
+
+
+def _fractional_bits(means: Floats, log_scales: Floats) -> int:
+    """Return the number of fractional bits by which all centres [N, 3] are in reach and none moves by much.
+
+    Raises
+    ------
+    InputError
+        There is none, or most Gaussians are of a size that the format does not hold.
+    """
+    if not len(means):
+        return FRACTIONAL_BITS
+    sizes = log_scales.max(axis=1)  # [N]
+    n_smaller = np.count_nonzero(sizes < LOG_SCALE_MIN)
+    size, reach = float(np.exp(np.median(sizes))), float(np.abs(means).max())
+    if 2 * n_smaller > len(sizes):
+        raise InputError(
+            f"SPZ holds scales from {math.exp(LOG_SCALE_MIN):.2g} on, but {n_smaller:,} of {len(sizes):,} Gaussians are"
+            f" smaller, the median is {size:.2g}: scale the scene, or choose another format"
+        )
+    if n_smaller > SMALLER_SHARE * len(sizes):
+        message = (
+            f"SPZ holds scales from {math.exp(LOG_SCALE_MIN):.2g} on: {n_smaller:,} of {len(sizes):,} Gaussians are"
+            " smaller, and become larger"
+        )
+        warnings.warn(one_line(message), InputWarning, stacklevel=3)
+    bits_max = FRACTIONAL_BITS_MAX
+    while bits_max >= 0 and math.floor(reach * 2.0**bits_max + 0.5) >= 2**23:
+        bits_max -= 1
+    bits = min(max(FRACTIONAL_BITS, math.ceil(-math.log2(STEP_MAX * size))), bits_max)
+    if bits < 0 or (bits < FRACTIONAL_BITS and 2.0**-bits > STEP_MAX * size):
+        row = int(np.argmax(np.abs(means).max(axis=1)))
+        raise InputError(
+            f"the centre of row {row} is {reach:.6g} away, where SPZ has steps of {2.0 ** -max(bits, 0):g}, and the"
+            f" median size is {size:.2g}: move the scene to the origin, remove what is far away, or choose another"
+            " format"
+        )
+    return bits
 
 
 def _to_bytes(values: Floats) -> NDArray[np.uint8]:
@@ -182,7 +220,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         The file is damaged, of another kind or version, or claims more than it holds.
     """
     header, body = _parse(content, source)
-    raw, begin = {}, 0
+    raw: dict[str, NDArray[np.uint8]] = {}
+    begin = 0
     for name, size in header.sizes.items():
         part = np.frombuffer(body, np.uint8, header.n * size, begin)
         raw[name] = part.reshape(header.n, size)
@@ -192,9 +231,14 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     words[..., 1:] = raw["means"].reshape(header.n, 3, 3)
     steps: Ints = words.view("<i4")[..., 0] >> 8  # [N, 3]
     levels = np.clip(raw["opacities"][:, 0].astype(np.float64), 0.25, 254.75)  # [N]
-    unpack_rotations: Any = _from_smallest_three if header.version == 3 else _from_vector
-    n_rest = header.sizes["sh_rest"] // 3
-    sh_rest = (raw["sh_rest"].reshape(header.n, n_rest, 3).astype(np.float32) - 128) / 128
+    unpack_rotations: Any = _from_vector if header.version == 2 else _from_smallest_three
+    n_rest = min(header.sizes["sh_rest"] // 3, len(SIGNS))
+    if header.sh_degree > SH_DEGREE_MAX:
+        message = f"{source}: its harmonics of degree {header.sh_degree} are cut off at degree {SH_DEGREE_MAX}"
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
+    sh_rest = (
+        raw["sh_rest"].reshape(header.n, header.sizes["sh_rest"] // 3, 3)[:, :n_rest].astype(np.float32) - 128
+    ) / 128
     fields = (
         steps * 2.0**-header.fractional_bits * _AXES,
         unpack_rotations(raw["rotations"]) * np.concatenate([[1.0], _AXES]),
@@ -211,7 +255,10 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
 def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
     """Return the header and all that follows it, after checking the header."""
     if content[:4] == struct.pack("<I", MAGIC):
-        raise InputError(f"{source}: SPZ of version 4 or later, which is not supported: export it as version 2 or 3")
+        streams = spz_streams.parse(content, source)
+        header = _Header(spz_streams.VERSION, streams.n, streams.sh_degree, streams.fractional_bits)
+        _check_header(header, source)
+        return header, spz_streams.unpack(streams, header.sizes, source)
     if content[:2] != b"\x1f\x8b":
         raise InputError(f"{source}: not an SPZ file, it is not packed by gzip; give one that ends in .spz")
     head, _ = _inflate(content, HEADER.size, source)
@@ -219,13 +266,9 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
         raise InputError(f"{source}: not an SPZ file, its content does not begin with NGSP; {WAY_OUT}")
     _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
     if version not in VERSIONS:
-        raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2 or 3")
-    if degree >= len(BYTES_OF_REST) or fractional_bits > 23:
-        raise InputError(
-            f"{source}: damaged, spherical harmonics of degree {degree} and {fractional_bits} fractional bits;"
-            f" {WAY_OUT}"
-        )
+        raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2, 3 or 4")
     header = _Header(version, n, degree, fractional_bits)
+    _check_header(header, source)
     n_bytes = HEADER.size + n * sum(header.sizes.values())
     if n_bytes > min(GZIP_RATIO_MAX * len(content), memory.free_bytes()):
         raise InputError(f"{source}: {n:,} Gaussians cannot be in {len(content):,} packed bytes; {WAY_OUT}")
@@ -235,6 +278,15 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
             f"{source}: truncated, {n_bytes:,} bytes and their end expected, {len(body):,} found; {WAY_OUT}"
         )
     return header, body[HEADER.size :]
+
+
+def _check_header(header: _Header, source: str | Path) -> None:
+    """Refuse a header of which two numbers are impossible."""
+    if header.sh_degree >= len(BYTES_OF_REST) or header.fractional_bits > FRACTIONAL_BITS_MAX:
+        raise InputError(
+            f"{source}: damaged, spherical harmonics of degree {header.sh_degree} and {header.fractional_bits}"
+            f" fractional bits; {WAY_OUT}"
+        )
 
 
 def _inflate(content: bytes, n_bytes: int, source: str | Path) -> tuple[bytes, bool]:
@@ -268,7 +320,7 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
 
 SPZ = Format(
     suffix=".spz",
-    summary="Niantic's, versions 3 and 2",
+    summary="Niantic's, versions 3 and 2 (4 is read)",
     levels=tuple(f"version {version}" for version in VERSIONS),
     default_level=0,
     encode=encode,

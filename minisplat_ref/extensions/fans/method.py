@@ -12,6 +12,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians, mesh_of, mesh_of_vjp
+from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.peeling import kernels as kernels
 from minisplat_ref.mechanisms.peeling import reference as reference
 from minisplat_ref.mechanisms.peeling.layers import ALL_LAYERS, Frame, Peeled, TranslucentMesh
@@ -20,7 +21,7 @@ from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.rates import LogLinear, Rates
-from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
@@ -115,6 +116,7 @@ def prune_faint_fans(state: TrainState, iteration: Iteration, *, min_opacity: fl
 FANS_OF_GAUSSIANS = Representation(
     "fans",
     population=Fans,
+    units={**WORLD_UNITS, "rims": Unit.PLACE},
     extend=partial(as_fans, **FanShape()._asdict()),
     renderer=Renderer("fans", partial(render, max_layers=None), render_vjp, channels),
     rates=Rates(

@@ -9,10 +9,11 @@ from minisplat_ref.extensions.mixed.kinds import promote_kinds, simplify_kinds
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, group_gaussians
 from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
 from minisplat_ref.extensions.mixed.response import RESPONSE, HullFootprints
+from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import Every
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats, Projection
@@ -80,6 +81,7 @@ def _replace_population(state: TrainState, population: MixedGaussians, changed: 
 MIXED_GAUSSIANS = Representation(
     "ellipses, lines and triangles",
     population=MixedGaussians,
+    units={**WORLD_UNITS, "vertices": Unit.LENGTH},
     extend=group_gaussians,
     renderer=payload_renderer("mixed", PAYLOAD),
     rates=Rates({"vertices": 2e-4, "n_vertices": 0.0}, frozenset({"vertices"})),

@@ -8,13 +8,14 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
+from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.sampling import block_means, sampling_intervals, zoom_camera
 from minisplat_ref.methods.gaussian_splatting import GS
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.strategy.ops import NO_PARENT, Edit, n_rows
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import At
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, View, view_from
@@ -38,6 +39,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
 LEVELS = Representation(
     "Gaussians in levels",
     population=MultiScaleGaussians,
+    units={**WORLD_UNITS, "cells": Unit.LENGTH},
     extend=level_zero,
     renderer=Renderer("multi-scale", render, SPLATTING.render_vjp, SPLATTING.channels),
     rates=Rates({"cells": 0.0}, frozenset()),

@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
+from minisplat_ref.io.frames import Unit
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.training.rates import LogLinear, Rates
-from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
 
 
@@ -60,6 +61,7 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGr
 MOVING = Representation(
     "moving Gaussians",
     population=MovingGaussians,
+    units={**WORLD_UNITS, "velocities": Unit.LENGTH},
     extend=at_rest,
     renderer=Renderer("velocity", render, render_vjp, SPLATTING.channels),
     # In one unit of time a Gaussian goes as far as its velocity: the rate of the means, per extent as theirs, and five

@@ -28,6 +28,7 @@ PARAMETERS = {"window_log": 17, "hash_log": 15, "chain_log": 16, "search_log": 3
 LEVEL = 19  # the source of all other parameters
 HEADER_MAX = 1 << 16  # bytes
 RATIO_MAX = 1 << 15  # bytes made of one packed byte: 2^17 of 4
+UNKNOWN_SIZE = -1  # of a frame that was written as a stream
 WAY_OUT = "copy or export the file again"
 _PREFIX = struct.Struct("<4sHI")
 
@@ -163,16 +164,27 @@ def unpack(packed: Packed, name: str, n_bytes: int) -> bytes:
     InputError
         There is no such stream, it holds another number of bytes, it is damaged, or it does not fit into memory.
     """
-    source, frame = packed.source, packed.frames.get(name)
+    frame = packed.frames.get(name)
     if frame is None:
-        raise InputError(f"{source}: damaged, it has no stream {name}; {WAY_OUT}")
+        raise InputError(f"{packed.source}: damaged, it has no stream {name}; {WAY_OUT}")
+    return unpack_frame(frame, n_bytes, name, packed.source)
+
+
+def unpack_frame(frame: bytes, n_bytes: int, name: str, source: str | Path) -> bytes:
+    """Return the unpacked bytes of a zstandard frame, which are to be as many as its file says.
+
+    Raises
+    ------
+    InputError
+        As for :func:`unpack`; ``name`` is the stream's, for messages.
+    """
     if n_bytes > RATIO_MAX * len(frame) or n_bytes > memory.free_bytes():
         raise InputError(
             f"{source}: its {name} would take {memory.as_text(n_bytes)}, made of {len(frame):,} bytes; {WAY_OUT}"
         )
     zstandard = _zstandard()
     try:
-        if zstandard.frame_content_size(frame) != n_bytes:
+        if zstandard.frame_content_size(frame) not in (n_bytes, UNKNOWN_SIZE):
             raise InputError(f"{source}: damaged, its {name} do not have {n_bytes:,} bytes; {WAY_OUT}")
         raw = bytes(zstandard.ZstdDecompressor().decompress(frame, max_output_size=n_bytes))
     except zstandard.ZstdError as error:
