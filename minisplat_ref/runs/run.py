@@ -142,7 +142,7 @@ def _train(
     if shows_preview:
         callbacks.append(make_preview(folder, scene, settings, progress))
     if settings.minutes is not None:
-        callbacks.append(_in_time(settings, recipe, progress))
+        callbacks.append(_in_time(settings, recipe, progress, len(scene.train_views)))
     callbacks.append(checkpoints.save_regularly(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
@@ -164,11 +164,12 @@ def _train(
         return progress.clock
 
 
-def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable[[StepReport], None]:
+def _in_time(settings: Settings, recipe: Recipe, progress: Progress, n_views: int) -> Callable[[StepReport], None]:
     """Return a callback of the loop that begins the cool-down in time to end after ``settings.minutes``.
 
     Halved views are left behind before that, because the cool-down shows the photographs as they are: when it would not
-    end in time with iterations that take as many times longer as the photographs have more pixels.
+    end in time with iterations that take as many times longer as the photographs have more pixels. A pass of the prune
+    over the training views is reckoned as an iteration for each.
     """
     cooling, minutes = recipe.cooling, settings.minutes
     assert cooling is not None and minutes is not None
@@ -181,8 +182,9 @@ def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable
         if state.pace.cooling_from is not None or len(clock) < 2:
             return
         length = math.ceil(cooling.part * report.step)
-        pace = (clock[-1] - clock[0]) / (len(clock) - 1)  # seconds an iteration
-        if left > 4**report.n_halvings * length * pace:
+        pace = 4**report.n_halvings * (clock[-1] - clock[0]) / (len(clock) - 1)  # seconds an iteration, at full size
+        left -= cooling.prune_passes * n_views * pace
+        if left > length * pace:
             return
         why = f"{minutes:g} minutes leave no more time"
         if report.n_halvings:

@@ -45,6 +45,8 @@ class AdamState(NamedTuple, Generic[Parameters]):
     """Mean squared gradient, field by field."""
     step: int
     """Steps taken."""
+    joined: Mapping[str, int] = {}  # not NOTHING, which cannot be copied; it is never changed
+    """Of fields that came later, the steps that had been taken before: their moments began at zero there."""
 
 
 def zero_moments(parameters: Parameters) -> AdamState[Parameters]:
@@ -97,17 +99,22 @@ def adam_step(
     state : AdamState
         The same arrays, one step further.
     """
-    step = state.step + 1
-    correction = math.sqrt(1 - rule.beta2**step) / (1 - rule.beta1**step) if rule.has_bias_correction else 1.0
-    eps = rule.eps * (math.sqrt(1 - rule.beta2**step) if rule.has_bias_correction else 1.0)
     rows = visible_ids if rule.is_visible_only else None
     bundles = [fields_of(bundle) for bundle in (parameters, gradient, state.first, state.second)]
     for name, rate in ((name, rates[name]) for name in bundles[0]):
         arrays = (bundle[name] for bundle in bundles)
         values, g, first, second = (a.reshape(len(a), math.prod(a.shape[1:])) for a in arrays)  # [N, width] each
-        update = AdamStep(rate * correction, rule.beta1, rule.beta2, eps)
+        update = _update_of(rule, rate, state.step + 1 - state.joined.get(name, 0))
         if name in widths:
             backend.adam_update(values, g, first, second, rows, update, widths[name])
         else:
             backend.adam_update(values, g, first, second, rows, update)
-    return state._replace(step=step)
+    return state._replace(step=state.step + 1)
+
+
+def _update_of(rule: AdamRule, rate: float, step: int) -> AdamStep:
+    """Return the numbers of a field's step, of which it is the ``step``-th since its moments were zero."""
+    if not rule.has_bias_correction:
+        return AdamStep(rate, rule.beta1, rule.beta2, rule.eps)
+    root = math.sqrt(1 - rule.beta2**step)
+    return AdamStep(rate * (root / (1 - rule.beta1**step)), rule.beta1, rule.beta2, rule.eps * root)

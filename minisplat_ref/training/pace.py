@@ -2,10 +2,10 @@
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
 measure the gain of more iterations; test views are never used. When an action of the recipe decides that the gain is
-small, or when the given number of iterations leaves no more time, a cool-down with falling rates on all training views
-ends the training (:func:`minisplat_ref.training.state.begin_cooling`). So a plateau is due to the scene and not to
-falling rates. Large photographs are halved at first; there, the decision is to train on views of twice the width and
-height.
+small, or when the given number of iterations leaves no more time, a cool-down with falling rates ends the training
+(:func:`minisplat_ref.training.state.begin_cooling`); from some point of it, all training views are trained on. So a
+plateau is due to the scene and not to falling rates. Large photographs are halved at first; there, the decision is to
+train on views of twice the width and height.
 """
 
 from collections.abc import Mapping
@@ -23,11 +23,18 @@ class Measurement(NamedTuple):
     n_gaussians: int
     n_pairs: int
     """Pairs (tile, Gaussian) of all iterations so far: the work."""
+    ssims: tuple[float, ...] = ()
+    """Of each view; empty where only the PSNR was asked for."""
 
     @property
     def psnr(self) -> float:
         """Return the mean of the views, dB."""
         return sum(self.psnrs) / len(self.psnrs)
+
+    @property
+    def ssim(self) -> float:
+        """Return the mean of the views."""
+        return sum(self.ssims) / len(self.ssims)
 
 
 class Decision(NamedTuple):
@@ -55,6 +62,15 @@ class Pace(NamedTuple):
     """Iteration at which the training ends; None while that is open."""
     switched_on: tuple[str, ...] = ()
     """Names of the calibrations that the photographs turned out to need."""
+    is_pruning: bool = False
+    """Whether views are still held back while the rates fall, to measure what the prune costs."""
+    before_slices: tuple[Measurement, ...] = ()
+    """Evaluations before each slice of the prune."""
+
+    @property
+    def holds_out(self) -> bool:
+        """Return whether some training views are held back now."""
+        return self.cooling_from is None or self.is_pruning
 
     @property
     def n_finer(self) -> int:
@@ -90,7 +106,10 @@ class Cooling(NamedTuple):
     last_per_extent: float
     """The same for rates per unit of the scene's extent; until the end, the factors' logarithms fall linearly."""
     hold_out_every: int
-    """Before the cool-down, one in this many training views is held back for decisions."""
+    """Until the cool-down, and until the end of a prune, one in this many training views is held back for decisions."""
+    prune_passes: int = 0
+    """Passes over all training views that a prune takes while the rates fall; 0 if the recipe has none. The prune ends
+    the holding back, too."""
 
     def factors(self, step: int, pace: Pace) -> tuple[float, float]:
         """Return the factors of the rates, and of those per unit of the extent, at an iteration."""
@@ -121,7 +140,7 @@ def held_out_ids(n_views: int, every: int) -> list[int]:
 
 def trained_ids(n_views: int, cooling: Cooling | None, pace: Pace) -> list[int]:
     """Return the training views that gradient steps may use now."""
-    if cooling is None or pace.cooling_from is not None:
+    if cooling is None or not pace.holds_out:
         return list(range(n_views))
     held = set(held_out_ids(n_views, cooling.hold_out_every))
     return [k for k in range(n_views) if k not in held]
@@ -133,6 +152,7 @@ def to_metadata(pace: Pace) -> dict[str, Any]:
         **pace._asdict(),
         "measurements": [m._asdict() for m in pace.measurements],
         "decisions": [d._asdict() for d in pace.decisions],
+        "before_slices": [m._asdict() for m in pace.before_slices],
     }
 
 
@@ -144,17 +164,23 @@ def from_metadata(value: Mapping[str, Any]) -> Pace:
     ValueError, TypeError, KeyError
         It is something else.
     """
-    measurements = tuple(
-        Measurement(int(m["step"]), tuple(map(float, m["psnrs"])), int(m["n_gaussians"]), int(m["n_pairs"]))
-        for m in value["measurements"]
-    )
+    measurements = tuple(map(_measurement, value["measurements"]))
+    before_slices = tuple(map(_measurement, value.get("before_slices", ())))  # not in older checkpoints
     decisions = tuple(
         Decision(int(d["step"]), str(d["what"]), str(d["why"]), _optional(d["gain"]), _optional(d["standard_error"]))
         for d in value["decisions"]
     )
     cooling_from, last_step = (None if value[n] is None else int(value[n]) for n in ("cooling_from", "last_step"))
     switched_on = tuple(str(name) for name in value["switched_on"])
-    return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on)
+    is_pruning = bool(value.get("is_pruning", False))
+    return Pace(
+        measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on, is_pruning, before_slices
+    )
+
+
+def _measurement(value: Mapping[str, Any]) -> Measurement:
+    psnrs, ssims = tuple(map(float, value["psnrs"])), tuple(map(float, value.get("ssims", ())))
+    return Measurement(int(value["step"]), psnrs, int(value["n_gaussians"]), int(value["n_pairs"]), ssims)
 
 
 def _optional(number: Any) -> float | None:

@@ -40,6 +40,7 @@ class Counters(NamedTuple):
     step: int
     adam_step: int
     shared_adam_step: int
+    shared_adam_joined: dict[str, int]
     view_order: list[int]
 
 
@@ -85,6 +86,8 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
     }
     if recipe.cooling is not None:
         metadata["pace"] = to_metadata(state.pace)
+    if state.shared_adam.joined:
+        metadata["shared_adam_joined"] = dict(state.shared_adam.joined)
     if state.frame != FILE_FRAME:
         metadata["frame"] = frame_to_json(state.frame)
     save_checkpoint(path, arrays, metadata, previous=previous)
@@ -119,7 +122,7 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
         read_generator(path, metadata.get("rng")),
         bundles.stats,
         bundles.shared,
-        AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step),
+        AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step, counters.shared_adam_joined),
         pace=pace,
         frame=read_frame(path, metadata),
     )
@@ -165,7 +168,11 @@ def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
     order = metadata.get("view_order")
     if not isinstance(order, list):
         raise DamagedCheckpoint(f"{path}: view_order is no list of views; {WAY_OUT}")
-    return Counters(step, adam_step, shared_step, [check("a number in view_order", view) for view in order])
+    joined = metadata.get("shared_adam_joined", {})
+    if not isinstance(joined, dict) or any(check(name, steps) >= shared_step + 1 for name, steps in joined.items()):
+        raise DamagedCheckpoint(f"{path}: shared_adam_joined is no record of the steps before fields came; {WAY_OUT}")
+    views = [check("a number in view_order", view) for view in order]
+    return Counters(step, adam_step, shared_step, joined, views)
 
 
 def read_pace(path: str | Path, value: Any) -> Pace:

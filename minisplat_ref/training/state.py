@@ -140,7 +140,9 @@ def n_pixels(scene: Scene) -> int:
 def begin_cooling(
     state: TrainState, cooling: Cooling, iterations: int, decision: Decision, length: int | None = None
 ) -> None:
-    """Begin the cool-down: from the next iteration on, rates fall and all training views are trained on.
+    """Begin the cool-down: from the next iteration on, rates fall, and all training views are trained on.
+
+    If the recipe prunes while the rates fall, views are held back until it has.
 
     Parameters
     ----------
@@ -156,7 +158,9 @@ def begin_cooling(
     """
     length = max(1, math.ceil(cooling.part * decision.step)) if length is None else length
     state.pace = state.pace.with_decision(decision)._replace(
-        cooling_from=decision.step, last_step=min(decision.step + length, iterations)
+        cooling_from=decision.step,
+        last_step=min(decision.step + length, iterations),
+        is_pruning=cooling.prune_passes > 0,
     )
     state.view_order = []
 

@@ -187,3 +187,16 @@ def test_zero_gradient_and_zero_rows(rng):
     assert_array_equal(p.b, before.b)
     empty = random_pair(rng, 0)
     assert adam_step(empty, empty, zero_moments(empty), RATES, DENSE, np.arange(0)).step == 1
+
+
+def test_a_field_that_joins_later_begins_with_the_bias_correction_of_its_own_first_step():
+    """Its first step is the rate, in the direction of the gradient: m / (1 - beta1) = g and v / (1 - beta2) = g^2."""
+    parameters = {"old": np.array([[1.0]]), "new": np.array([[5.0]])}
+    gradient = {"old": np.array([[3.0]]), "new": np.array([[-7.0]])}
+    state = zero_moments(parameters)._replace(step=400, joined={"new": 400})
+    state.first["old"][:], state.second["old"][:] = 3.0, 9.0  # as after many steps of this gradient
+    rates, rows = {"old": 0.1, "new": 0.2}, np.arange(1)
+    state = adam_step(parameters, gradient, state, rates, DENSE, rows)
+    assert_allclose(parameters["new"], 5.2)
+    assert 0.9 < parameters["old"].item() < 0.95  # 400 steps are few for beta2: sqrt(1 - 0.999^401) = 0.57
+    assert state.step == 401 and state.joined == {"new": 400}

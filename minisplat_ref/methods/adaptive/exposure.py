@@ -68,17 +68,18 @@ def ask_about_exposures(state: TrainState, iteration: Iteration) -> Answer:
 
 
 def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:
-    """Keep the mean exposure of the views in training at the identity; views that join start with their gains."""
+    """Keep the mean exposure of the views in training at the identity."""
     if EXPOSURES not in state.shared:
         return
-    n_views = len(iteration.scene.train_views)
     exposures = state.shared[EXPOSURES]
-    if state.pace.cooling_from is not None and iteration.step == state.pace.cooling_from + 1:
-        before = trained_ids(n_views, iteration.cooling, state.pace._replace(cooling_from=None))
-        new = [index for index in range(n_views) if index not in set(before)]
-        _begin_with(exposures, new, log_gains(state, iteration, new))
-    ids = trained_ids(n_views, iteration.cooling, state.pace)
+    ids = trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace)
     exposures[ids] -= exposures[ids].mean(axis=0) - np.eye(3, 4, dtype=exposures.dtype)
+
+
+def begin_exposures(state: TrainState, iteration: Iteration, view_ids: list[int]) -> None:
+    """Have views that join the training start with their gains."""
+    if EXPOSURES in state.shared:
+        _begin_with(state.shared[EXPOSURES], view_ids, log_gains(state, iteration, view_ids))
 
 
 def _begin_with(exposures: Floats, view_ids: list[int], gains: Floats) -> None:

@@ -131,6 +131,8 @@ REMOVAL_SLOPE_MIN = 1.0
 doubling of the count, before the others learn to replace it. Less keeps more Gaussians for under 0.1 dB (C)."""
 PRUNED_MAX = 0.2
 """Fraction of the Gaussians in a slice, at most. No reason recorded."""
+PSNR_COST_MAX, SSIM_COST_MAX = 0.1, 0.005
+"""dB and SSIM that the prune may cost on held-out training views, in all slices together."""
 N_SLICES = 8
 """Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
 eight."""

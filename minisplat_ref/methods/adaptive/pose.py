@@ -46,7 +46,7 @@ def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
 
 def turn_held_out(state: TrainState, iteration: Iteration) -> str | None:
     """Turn the held-out training views so that they show what the scene shows, if poses are refined."""
-    if ROTATIONS not in state.shared or iteration.cooling is None or state.pace.cooling_from is not None:
+    if ROTATIONS not in state.shared or iteration.cooling is None or not state.pace.holds_out:
         return "nothing done: no poses are refined"
     views = iteration.scene.train_views
     ids = held_out_ids(len(views), iteration.cooling.hold_out_every)

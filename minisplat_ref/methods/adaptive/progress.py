@@ -4,28 +4,38 @@ import numpy as np
 
 from minisplat_ref.methods.adaptive.exposure import log_gains
 from minisplat_ref.methods.adaptive.numbers import MEASUREMENTS_MIN
-from minisplat_ref.metrics import psnr
+from minisplat_ref.metrics import psnr, ssim
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.calibration import EXPOSURES
-from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, held_out_ids
+from minisplat_ref.training.pace import COOLED, FINER, Cooling, Decision, Measurement, held_out_ids
 from minisplat_ref.training.state import Iteration, TrainState, begin_cooling
 
 
 def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     """Render the held-out training views and record their PSNR."""
     if iteration.cooling is None or state.pace.cooling_from is not None:
-        return "nothing done: all training views are trained on"
+        return "nothing done: the rates fall"
+    measurement = evaluate_held_out(state, iteration, iteration.cooling)
+    state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))
+    return f"{measurement.psnr:.2f} dB"
+
+
+def evaluate_held_out(
+    state: TrainState, iteration: Iteration, cooling: Cooling, *, has_ssim: bool = False
+) -> Measurement:
+    """Return the PSNR of the held-out training views, and the SSIM if it is asked for."""
     views = iteration.scene.train_views
-    ids, psnrs = held_out_ids(len(views), iteration.cooling.hold_out_every), []
+    ids, psnrs, ssims = held_out_ids(len(views), cooling.hold_out_every), [], []
     # Their exposures are not trained and must not enter the measurement. For poses, see turn_held_out.
     gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
     for index, gain in zip(ids, gains.astype(np.float32), strict=True):
         view = views[index].load()
         output, _ = iteration.render_settings.render(state.model, view)
-        psnrs.append(psnr(np.clip(gain * output.image, 0.0, 1.0), view.image, view.mask))
-    measurement = Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs)
-    state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))
-    return f"{measurement.psnr:.2f} dB"
+        image = np.clip(gain * output.image, 0.0, 1.0)
+        psnrs.append(psnr(image, view.image, view.mask))
+        if has_ssim:
+            ssims.append(ssim(image, view.image, view.mask))
+    return Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs, tuple(ssims))
 
 
 def proceed_when_little_is_gained(

@@ -1,21 +1,29 @@
 """How ``adaptive`` prunes: in slices, while the rates fall, what the photographs would hardly miss.
 
-With the cool-down all photographs are trained on, and the error falls because the rates do. What most Gaussians add to
-the images is then known: :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each
-of them, in one pass over the training views. Those that are not worth their place go, a slice at a time; after each
-slice the training repairs what it can, and the changes are recomputed. At the end of the cool-down nothing is
-removed, so that it can converge.
+The error falls because the rates do. What most Gaussians add to the images is then known:
+:mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each of them, in one pass over
+the training views. Those that are not worth their place go, a slice at a time; after each slice the training repairs
+what it can, and the changes are recomputed.
+
+What that costs is measured, too, on the training views that are held out: before each slice their PSNR and SSIM are
+compared with the best so far. When the next slice would cost more than a tenth of a decibel, or five thousandths of
+SSIM, in all, the prune ends. So it does where no slice is due anymore: at the end of the cool-down nothing is removed,
+and all photographs are trained on, so that it can converge.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.methods.adaptive.exposure import begin_exposures
 from minisplat_ref.methods.adaptive.numbers import GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
+from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.strategy.removal import collect_removal_costs, worth_their_place
-from minisplat_ref.training.pace import Decision, Pace
+from minisplat_ref.training.pace import Decision, Measurement, Pace, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 
 
@@ -31,9 +39,16 @@ def slice_due(pace: Pace, step: int) -> int | None:
 
 
 def prune_in_slices(
-    state: TrainState, iteration: Iteration, *, min_views: int, min_slope: float, max_pruned: float
+    state: TrainState,
+    iteration: Iteration,
+    *,
+    min_views: int,
+    min_slope: float,
+    max_pruned: float,
+    max_psnr_cost: float,
+    max_ssim_cost: float,
 ) -> None:
-    """Remove Gaussians that the training views would hardly miss, a slice at a time, while the rates fall.
+    """Remove Gaussians that the training views would hardly miss, a slice at a time, until that costs too much.
 
     Parameters
     ----------
@@ -46,9 +61,26 @@ def prune_in_slices(
         relative: 1.0 is 3 dB for each doubling, before the others learn to replace them.
     max_pruned : float
         A slice is at most this fraction of the Gaussians.
+    max_psnr_cost, max_ssim_cost : float
+        What all slices together may cost on the held-out training views, dB and without a unit.
     """
+    if not state.pace.is_pruning or iteration.cooling is None:
+        return
     number = slice_due(state.pace, iteration.step)
     if number is None:
+        if is_over(state.pace, iteration.step):
+            take_all_views(state, iteration)
+        return
+    now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
+    state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
+    psnr_cost, ssim_cost = foreseen_costs(state.pace.before_slices)
+    if psnr_cost > max_psnr_cost or ssim_cost > max_ssim_cost:
+        _record(
+            state,
+            iteration,
+            f"ends: one more slice may cost held-out views {psnr_cost:.2f} dB, {ssim_cost:.4f} of SSIM",
+        )
+        take_all_views(state, iteration)
         return
     if number == 0:
         prune_seen_by_few(state, iteration, min_views)
@@ -66,6 +98,36 @@ def prune_in_slices(
     lost = 10.0 * np.log10(1.0 + float(np.delete(costs.changes, rows).sum()) / costs.squared_error)
     why = f"{n - len(rows):,} of {n:,} Gaussians change the training views by {lost:.2f} dB"
     _record(state, iteration, why)
+
+
+def is_over(pace: Pace, step: int) -> bool:
+    """Return whether no slice is due at an iteration or later."""
+    if pace.cooling_from is None or pace.last_step is None:
+        return False
+    since = step - pace.cooling_from - 1
+    return since > LAST_SLICE * (pace.last_step - pace.cooling_from)
+
+
+def foreseen_costs(before_slices: Sequence[Measurement]) -> tuple[float, float]:
+    """Return what the prune will have cost after one more slice: PSNR in dB, and SSIM.
+
+    The cost so far is the best value less the present one; one more slice is taken to cost what the last one did.
+    Before the first slice both are 0.
+    """
+    costs = []
+    for values in ([m.psnr for m in before_slices], [m.ssim for m in before_slices]):
+        last = max(0.0, values[-2] - values[-1]) if len(values) > 1 else 0.0
+        costs.append(max(values) - values[-1] + last)
+    return costs[0], costs[1]
+
+
+def take_all_views(state: TrainState, iteration: Iteration) -> None:
+    """End the prune: from the next iteration on, all training views are trained on."""
+    n_views = len(iteration.scene.train_views)
+    held_out = set(range(n_views)) - set(trained_ids(n_views, iteration.cooling, state.pace))
+    begin_exposures(state, iteration, sorted(held_out))
+    state.pace = state.pace._replace(is_pruning=False)
+    state.view_order = []
 
 
 def prune_seen_by_few(state: TrainState, iteration: Iteration, min_views: int) -> None:

@@ -80,6 +80,8 @@ ADAPTIVE = GS._replace(
                 min_views=numbers.SEEN_BY_MIN,
                 min_slope=numbers.REMOVAL_SLOPE_MIN,
                 max_pruned=numbers.PRUNED_MAX,
+                max_psnr_cost=numbers.PSNR_COST_MAX,
+                max_ssim_cost=numbers.SSIM_COST_MAX,
             )
         ),
         During(partial(cut_degrees_when_cooling, min_variation=numbers.VARIATION_MIN)),
@@ -87,7 +89,11 @@ ADAPTIVE = GS._replace(
     min_views=numbers.TRAIN_VIEWS_MIN,
     starts_densely=True,
     cooling=Cooling(
-        numbers.COOLING_PART, numbers.COOLING_LAST, numbers.COOLING_LAST_PER_EXTENT, numbers.HOLD_OUT_EVERY
+        numbers.COOLING_PART,
+        numbers.COOLING_LAST,
+        numbers.COOLING_LAST_PER_EXTENT,
+        numbers.HOLD_OUT_EVERY,
+        prune_passes=numbers.N_SLICES + 1,
     ),
 )
 """``adaptive``."""

@@ -92,8 +92,11 @@ def add_calibration(
     """
     zeros = zero_moments(parameters)
     state.shared = {**state.shared, **parameters}
-    state.shared_adam = state.shared_adam._replace(
-        first={**state.shared_adam.first, **zeros.first}, second={**state.shared_adam.second, **zeros.second}
+    adam = state.shared_adam
+    state.shared_adam = adam._replace(
+        first={**adam.first, **zeros.first},
+        second={**adam.second, **zeros.second},
+        joined={**adam.joined, **dict.fromkeys(parameters, adam.step)},
     )
     pace = state.pace.with_decision(decision)
     state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
@@ -13,9 +13,10 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.methods.adaptive import prune
 from minisplat_ref.methods.adaptive.growth import grow
 from minisplat_ref.methods.adaptive.progress import proceed_when_little_is_gained
-from minisplat_ref.methods.adaptive.prune import N_SLICES, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.prune import N_SLICES, foreseen_costs, prune_in_slices, slice_due
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.rendering import SPLATTING, RenderSettings
@@ -201,7 +202,7 @@ def test_slices_are_spread_over_the_first_part_of_the_cool_down():
     ]
 
 
-PRUNING = {"min_views": 2, "min_slope": 0.3, "max_pruned": 0.2}
+PRUNING = {"min_views": 2, "min_slope": 0.3, "max_pruned": 0.2, "max_psnr_cost": np.inf, "max_ssim_cost": np.inf}
 
 
 @pytest.fixture
@@ -210,8 +211,9 @@ def cooling(scene):
     state = initial_state(scene, ADAPTIVE._replace(starts_densely=False), 0)
     centres = np.array([view.camera.center for view in scene.train_views])
     state.gaussians.means[0] = 100 * (centres.mean(axis=0) - scene.points.mean(axis=0))
-    state.pace = Pace(cooling_from=10, last_step=110)
-    return state, Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background))
+    state.pace = Pace(cooling_from=10, last_step=110, is_pruning=True)
+    here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background))
+    return state, here._replace(cooling=ADAPTIVE.cooling)
 
 
 def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
@@ -236,6 +238,52 @@ def test_what_the_photographs_would_hardly_miss_goes_in_slices(cooling):
     assert "40 of 200 Gaussians change the training views by" in state.pace.decisions[-1].why
     prune_in_slices(state, here._replace(step=51), **settings | {"min_slope": 1e-9})
     assert len(state.gaussians.means) == 160 and len(state.pace.decisions) == 1  # a slice of less than 1 % is left out
+
+
+def of_values(psnrs, ssims):
+    return [
+        Measurement(10 * k, (p - 1, p + 1), 10, 0, (s, s)) for k, (p, s) in enumerate(zip(psnrs, ssims, strict=True))
+    ]
+
+
+def test_what_the_prune_will_have_cost():
+    """The best less the present value, and once more what the last slice cost."""
+    assert foreseen_costs(of_values([20.0], [0.5])) == (0.0, 0.0)
+    assert_allclose(foreseen_costs(of_values([20.0, 20.3], [0.5, 0.49])), (0.0, 0.02))
+    assert_allclose(foreseen_costs(of_values([20.0, 20.3, 20.25, 20.22], [0.5] * 4)), (0.08 + 0.03, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("limits", "ends"), [((0.1, np.inf), "0.20 dB"), ((np.inf, 0.005), "0.0200 of SSIM"), ((1, 1), "")]
+)
+def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypatch, limits, ends):
+    """After a slice that cost 0.1 dB and 0.01 of SSIM, the next would make it twice as much; then all views train."""
+    state, here = cooling
+    values = iter(of_values([20.0, 19.9, 19.9], [0.50, 0.49, 0.49]))
+    monkeypatch.setattr(prune, "evaluate_held_out", lambda *_, **__: next(values))
+    settings = PRUNING | {"min_slope": 1e9, "max_psnr_cost": limits[0], "max_ssim_cost": limits[1]}
+    n_trained = len(trained_ids(len(here.scene.train_views), here.cooling, state.pace))
+    assert n_trained < len(here.scene.train_views)
+    prune_in_slices(state, here._replace(step=11), **settings)
+    state.view_order = [1, 2]
+    prune_in_slices(state, here._replace(step=31), **settings)
+    assert state.pace.is_pruning == (not ends) and ends in state.pace.decisions[-1].why
+    assert len(trained_ids(len(here.scene.train_views), here.cooling, state.pace)) == (
+        len(here.scene.train_views) if ends else n_trained
+    )
+    assert (state.view_order == []) == bool(ends)
+    n = len(state.gaussians.means)
+    prune_in_slices(state, here._replace(step=51), **settings)
+    assert (len(state.gaussians.means) == n) == bool(ends)
+
+
+def test_the_prune_ends_where_no_slice_is_due_anymore(cooling):
+    """After 64 of 100 iterations, whether the last slice was one or not."""
+    state, here = cooling
+    prune_in_slices(state, here._replace(step=75), **PRUNING)
+    assert state.pace.is_pruning
+    prune_in_slices(state, here._replace(step=76), **PRUNING)
+    assert not state.pace.is_pruning
 
 
 def test_a_renderer_that_does_not_say_is_not_pruned_by_it(cooling):

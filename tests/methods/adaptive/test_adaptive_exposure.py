@@ -8,6 +8,7 @@ from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure, log_gains
+from minisplat_ref.methods.adaptive.prune import take_all_views
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.switches import switch_exposure_on
 from minisplat_ref.rendering import render
@@ -100,8 +101,11 @@ def test_the_mean_stays_the_identity(disturbed, truth):
     after = state.shared[EXPOSURES]
     assert_allclose(after[ids].mean(axis=0), np.eye(3, 4), atol=1e-6)
     assert_allclose(after[ids] - after[ids[0]], before[ids] - before[ids[0]], atol=1e-6)
-    state.pace = state.pace._replace(cooling_from=700, last_step=900)
+    state.pace = state.pace._replace(cooling_from=700, last_step=900, is_pruning=True)
     hold_mean_exposure(state, iteration_of(disturbed, 701))
+    assert_array_equal(state.shared[EXPOSURES][held], before[held])
+    take_all_views(state, iteration_of(disturbed, 750))
+    hold_mean_exposure(state, iteration_of(disturbed, 751))
     joined = state.shared[EXPOSURES]
     assert_allclose(joined.mean(axis=0), np.eye(3, 4), atol=1e-6)
     ratios = joined[held, 0, 0] / joined[held[0], 0, 0]
