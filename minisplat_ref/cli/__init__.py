@@ -34,6 +34,7 @@ from . import (
     extensions,
     info,
     oracle,
+    photos,
     render,
     sfm,
     simplify,
@@ -44,7 +45,7 @@ from . import (
 )
 
 GROUPS = {
-    "start here": (demo,),
+    "start here": (demo, photos),
     "preparing scenes": (sfm, undistort, downscale, synthetic),
     "training and its results": (train, render, evaluate, simplify, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
@@ -57,8 +58,7 @@ DESCRIPTION = """\
 measure it, and check every formula against a reference that can be read.
 
 First time here:   minisplat-ref demo
-Your own photos:   minisplat-ref sfm PHOTOS --out SCENE
-                   minisplat-ref train SCENE --out runs/mine
+Your own photos:   minisplat-ref photos PHOTOS --out mine
 """
 EPILOG = "Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."
 

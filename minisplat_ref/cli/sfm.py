@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 FEATURES = ("auto", "standard", "dense")
 MATCHINGS = ("exhaustive", "sequential")
-TRAINING_SIDE = 480  # pixels of the longer side, about
 CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 DESCRIPTION = """\
@@ -134,9 +133,10 @@ def _propose_training(result: "SfmResult", out: Path) -> list[str]:
     from minisplat_ref.io.images import downscaled_size
     from minisplat_ref.reports.commands import command
     from minisplat_ref.runs.notices import describe_sizes
+    from minisplat_ref.runs.proposed_size import comfortable_factor
 
     width, height = max(result.sizes, key=max)
-    factor = max(1, round(max(width, height) / TRAINING_SIDE))
+    factor = comfortable_factor(width, height)
     smaller = " x ".join(map(str, downscaled_size(width, height, factor)))
     options = ("--downscale", str(factor)) if factor > 1 else ()
     sizes = f"photographs of {describe_sizes(result.sizes)} pixels"

@@ -27,6 +27,12 @@ LARGE = 960  # from which a smaller size is proposed
 REPEATS = 3
 
 
+def comfortable_factor(width: int, height: int) -> int:
+    """Return the factor by which photographs of this size, in pixels, are made smaller for a training of minutes."""
+    side = max(width, height)
+    return 1 if side < LARGE else math.ceil(side / COMFORTABLE)
+
+
 def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings) -> str | None:
     """Return a line that proposes a size, or None if the photographs are small enough or the backend is not compiled.
 
@@ -43,9 +49,9 @@ def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings)
         return None  # NumPy takes minutes for what is timed here
     view = max(scene.train_views, key=lambda view: view.camera.width * view.camera.height)
     width, height = view.camera.width, view.camera.height
-    if max(width, height) < LARGE:
+    factor = comfortable_factor(width, height)
+    if factor == 1:
         return None
-    factor = math.ceil(max(width, height) / COMFORTABLE)
     small = view._replace(camera=rescale_camera(view.camera, *downscaled_size(width, height, factor)))
     large_seconds, small_seconds = (_iteration_seconds(state.model, each, recipe, settings) for each in (view, small))
     return (

@@ -1,0 +1,104 @@
+"""``photos``: from a folder of photographs to a report and a film, in one command."""
+
+import argparse
+from pathlib import Path
+
+from minisplat_ref.arguments import Commands, HelpFormatter, integer, positive
+from minisplat_ref.cli.sfm import MATCHINGS
+from minisplat_ref.errors import InputError
+
+SCENE, RUN, FILM = "scene", "run", "film.gif"
+
+DESCRIPTION = """\
+Make a 3D model of what photographs show: find their cameras, choose a size that
+a laptop trains in minutes, train, and make a film along the photographer's
+path. It prints the command of each step, which can be given alone to choose
+more. DIR will hold:
+
+  scene/     the photographs with their cameras, a COLMAP scene (sfm)
+  run/       report.html, point_cloud.ply, metrics.json and more (train)
+  film.gif   (render)
+
+Some 20 to 60 photographs of something that stands still, taken from places a
+step apart, with a lot of overlap, are a good start. After an interruption the
+same command continues.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref photos holiday/fountain
+  minisplat-ref photos holiday/fountain --minutes 10 --out fountain"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "photos",
+        help="your photographs: cameras, training, film and report in one",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for all of it (default splats/PHOTOS)")
+    parser.add_argument("--minutes", type=positive, metavar="T", help="the most minutes to train (default: as needed)")
+    parser.add_argument(
+        "--downscale",
+        type=integer(1),
+        metavar="K",
+        help="train at 1/K of the scene's width and height (default: of at most 640 pixels)",
+    )
+    parser.add_argument(
+        "--matching",
+        choices=MATCHINGS,
+        default=MATCHINGS[0],
+        metavar="M",
+        help="exhaustive (default), or sequential for frames of a video",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the steps that have not been done, and say where their results are."""
+    from minisplat_ref.reports.commands import command
+    from minisplat_ref.runs import run_folder, settings
+
+    folder = args.out or Path("splats") / args.photos.resolve().name
+    scene, trained, film = (folder / name for name in (SCENE, RUN, FILM))
+    if not args.photos.is_dir():
+        raise InputError(f"{args.photos} is no folder: give the folder of your photographs")
+    if not scene.exists():
+        _do("sfm", args.photos, "--out", scene, "--matching", args.matching)
+    if not run_folder.has_begun(trained):
+        factor = _choose_factor(scene) if args.downscale is None else args.downscale
+        limit = () if args.minutes is None else ("--minutes", f"{args.minutes:g}")
+        code = _do("train", scene, "--downscale", str(factor), *limit, "--out", trained)
+    elif not run_folder.is_finished(trained, settings.load(trained).iterations):
+        code = _do("train", "--resume", trained)
+    else:
+        code = 0
+    if code != 0:
+        return code
+    if not film.exists():
+        _do("render", trained, "--cameras", "orbit", "--film", film)
+    print(f"open {(trained / run_folder.REPORT).resolve()}")
+    print(f"smaller: {command('simplify', trained, '--out', folder / 'small')}")
+    return 0
+
+
+def _do(*words: str | Path) -> int:
+    """Print a command, and run it."""
+    from minisplat_ref.cli import build_parser
+    from minisplat_ref.reports.commands import command
+
+    print(f"$ {command(*words)}", flush=True)
+    args = build_parser().parse_args([str(word) for word in words])
+    return args.run(args)
+
+
+def _choose_factor(scene: Path) -> int:
+    """Return the factor by which photographs are made smaller for the training."""
+    from minisplat_ref.io.images import image_size
+    from minisplat_ref.runs.proposed_size import comfortable_factor
+
+    sizes = [image_size(file) for file in sorted((scene / "images").rglob("*")) if file.is_file()]
+    return comfortable_factor(*max(sizes, key=max))

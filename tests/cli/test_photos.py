@@ -1,0 +1,73 @@
+"""``photos``: from photographs to a report and a film, what it prints, and that it continues."""
+
+import numpy as np
+import pytest
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.runs.proposed_size import comfortable_factor
+from run_commands import interrupt_at
+from textured_world import HEIGHT, WIDTH, take_photographs, write_photographs
+
+SCENE = {"n_views": 12, "width": 48, "height": 36, "n_points": 100, "test_every": 8}
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A folder in which the cameras have been found."""
+    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "out" / "scene", SCENE)
+    (tmp_path / "photos").mkdir()
+    return tmp_path / "out"
+
+
+def photos(out, *options):
+    return main(["photos", str(out.parent / "photos"), "--out", str(out), *options])
+
+
+def steps_of(text):
+    """Return the first words of the commands that were printed and run."""
+    return [line.split()[2] for line in text.splitlines() if line.startswith("$ ")]
+
+
+def test_from_photographs_to_a_film(tmp_path, capsys):
+    shots = take_photographs(np.random.default_rng(3), (1.1 * WIDTH,) * 9)
+    write_photographs(tmp_path / "photos", shots, (24.0,) * 9)
+    out = tmp_path / "out"
+    assert photos(out, "--minutes", "0.1", "--downscale", "4") == 0
+    printed = capsys.readouterr().out
+    assert steps_of(printed) == ["sfm", "train", "render"]
+    assert ": 9 of 9 photographs (100%)" in printed and f" of {WIDTH // 4} x {HEIGHT // 4}," in printed
+    assert all((out / name).exists() for name in ("scene/sparse/0", "run/report.html", "run/metrics.json", "film.gif"))
+    assert printed.splitlines()[-2] == f"open {out / 'run' / 'report.html'}"
+    assert printed.splitlines()[-1].startswith("smaller: ") and "simplify" in printed.splitlines()[-1]
+
+
+def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):
+    """After an interruption of the training it continues there; at the end nothing is left to do."""
+    with monkeypatch.context() as patched:
+        interrupt_at(7, patched)
+        assert photos(out, "--minutes", "0.1") == 130
+    assert steps_of(capsys.readouterr().out) == ["train"]
+    assert photos(out) == 0
+    assert steps_of(capsys.readouterr().out) == ["train", "render"]
+    (out / "film.gif").unlink()
+    assert photos(out) == 0
+    assert steps_of(capsys.readouterr().out) == ["render"]
+    assert photos(out) == 0
+    assert steps_of(capsys.readouterr().out) == []
+
+
+def test_a_folder_that_is_not_there(tmp_path, capsys):
+    assert photos(tmp_path / "out") == 2
+    assert "is no folder: give the folder of your photographs" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("size", "factor"),
+    [((640, 480), 1), ((959, 500), 1), ((960, 500), 2), ((700, 1280), 2), ((1281, 9), 3), ((4000, 3000), 7)],
+)
+def test_a_size_that_trains_in_minutes(size, factor):
+    """From 960 pixels on, the smallest factor after which the longer side has at most 640."""
+    assert comfortable_factor(*size) == factor
