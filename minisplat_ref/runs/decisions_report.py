@@ -22,6 +22,7 @@ DONE = {
     "poses": "the refinement of poses was switched on",
     "anti-aliasing": "opacities were compensated for anti-aliasing",
     "prune": "it pruned",
+    "prune ended": "the prune ended",
     "bands": "it removed idle bands of the harmonics",
 }
 HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")

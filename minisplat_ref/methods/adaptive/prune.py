@@ -75,11 +75,8 @@ def prune_in_slices(
     state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
     psnr_cost, ssim_cost = foreseen_costs(state.pace.before_slices)
     if psnr_cost > max_psnr_cost or ssim_cost > max_ssim_cost:
-        _record(
-            state,
-            iteration,
-            f"ends: one more slice may cost held-out views {psnr_cost:.2f} dB, {ssim_cost:.4f} of SSIM",
-        )
+        why = f"with one more slice it may have cost held-out views {psnr_cost:.2f} dB and {ssim_cost:.4f} of SSIM"
+        state.pace = state.pace.with_decision(Decision(iteration.step, "prune ended", why, None, None))
         take_all_views(state, iteration)
         return
     if number == 0:

@@ -92,7 +92,7 @@ def test_it_ends_after_the_cool_down(reports):
     pruned = [other for other in others if other.what == "prune"]
     assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned[0].step - 1
     assert [other.step for other in others if other.what == "bands"] == [decision.step + 1]
-    assert {other.what for other in others} == {"prune", "bands"}
+    assert {other.what for other in others} == {"prune", "prune ended", "bands"}
     assert state.step == state.pace.last_step == min(700, decision.step + -(-6 * decision.step // 10))
     assert seen[0][2] is None and seen[-1][2] == state.step
     assert [m.step for m in state.pace.measurements] == list(range(200, decision.step + 1, 100))
@@ -372,7 +372,7 @@ def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
     assert metrics["has_ended_early"] and metrics["iterations"] == decisions["last_step"] == 1280
     assert len(decisions["measurements"])
     first, *others = [decision["what"] for decision in decisions["decisions"]]
-    assert first == "cool down" and set(others) == {"prune", "bands"} and others.count("bands") == 1
+    assert first == "cool down" and set(others) == {"prune", "prune ended", "bands"} and others.count("bands") == 1
     assert json.loads((run / "config.json").read_text())["settings"]["iterations"] == 30_000
     capsys.readouterr()
     assert main(["info", str(run)]) == 0

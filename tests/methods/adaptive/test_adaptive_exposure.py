@@ -135,7 +135,7 @@ def test_training_recovers_the_gains_and_continues_byte_for_byte(disturbed, tmp_
 
     straight = train(disturbed, recipe, seed=0, on_step=save)
     whats = [decision.what for decision in straight.pace.decisions]
-    assert whats[:2] == ["exposures", "cool down"] and set(whats[2:]) == {"prune", "bands"}
+    assert whats[:2] == ["exposures", "cool down"] and set(whats[2:]) == {"prune", "prune ended", "bands"}
     found = straight.shared[EXPOSURES][:, :, :3].trace(axis1=1, axis2=2) / 3
     assert np.corrcoef(found, GAINS)[0, 1] > 0.95
     for path in saved:
