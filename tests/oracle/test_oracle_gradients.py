@@ -9,7 +9,7 @@ from minisplat_ref import gsplat_compat
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
-from minisplat_ref.gsplat_compat import RENDER_MODES
+from minisplat_ref.gsplat_arguments import RENDER_MODES
 from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.differences import (
     CENTRAL,
