@@ -128,6 +128,8 @@ def run(args: argparse.Namespace) -> int:
     }
     report = as_report(renderer, rows, settings)
     code = publish(report, args)
+    for line in report.settings["looks_like"]:
+        print(line)
     if report.settings["not_given"]:
         print(f"not given: {', '.join(report.settings['not_given'])}")
     if left_out:
