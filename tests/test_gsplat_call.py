@@ -301,7 +301,7 @@ def test_what_is_no_covariance_is_refused(rng):
 def test_small_radii_are_culled(backend, rng):
     call = make_call(rng) | {"backend": backend}
     radii = rasterization(**call)[2]["radii"]  # [C, N, 2]
-    clip = float(np.median(radii.max(axis=2)))
+    clip = float(np.sort(radii.max(axis=2).ravel())[10])  # one that a Gaussian has
     is_small = (radii <= clip).all(axis=2)
     assert 3 < is_small.sum() < 17
     images, _, meta = rasterization(**call, radius_clip=clip)

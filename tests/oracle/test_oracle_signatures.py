@@ -210,6 +210,7 @@ def test_without_a_meta_a_wrong_conic_is_not_blamed_on_the_blending_alone():
     assert "  1. the conic's off-diagonal off by a factor in the projection\n" in text
     asked = next(line for line in text.splitlines() if line.startswith("to tell these apart, return "))
     assert "conics" in asked and asked.endswith("as well (a function: in its meta)")
+    assert "depths" not in asked  # with none of the three they are wrong
 
 
 def test_with_it_the_conic_is_named():
