@@ -23,7 +23,7 @@ API = {
         "Rendering",
         ("minisplat_ref.rendering", "minisplat_ref.splatting", "minisplat_ref.backends", "minisplat_ref.stages"),
     ),
-    "gsplat_compat": ("gsplat's call", ("minisplat_ref.gsplat_compat",)),
+    "gsplat_compat": ("gsplat's call", ("minisplat_ref.gsplat_compat", "minisplat_ref.gsplat_arguments")),
     "reference": ("The reference", ("minisplat_ref.reference",)),
     "strategy": ("Density control", ("minisplat_ref.strategy",)),
     "training": ("Training", ("minisplat_ref.training",)),

@@ -25,7 +25,7 @@ class PlantedLine(NamedTuple):
 _CALL = (
     PlantedLine(
         "expected depth: sign of alpha's gradient",
-        "gsplat_compat:rasterization_vjp",
+        "gsplat_compat:_batch_vjp",
         "v_alpha + v_alpha_of_depth",
         "v_alpha - v_alpha_of_depth",
     ),
@@ -44,9 +44,7 @@ _CALL = (
         "expected_depth(images[..., -1], alphas)",
         "images[..., -1]",
     ),
-    PlantedLine(
-        "colours of all cameras to the first", "gsplat_compat:rasterization_vjp", "v_colors[c] if", "v_colors[0] if"
-    ),
+    PlantedLine("colours of all cameras to the first", "gsplat_compat:_batch_vjp", "v_colors[c] if", "v_colors[0] if"),
     PlantedLine(
         "camera's centre by the transpose", "gsplat_compat:_remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"
     ),

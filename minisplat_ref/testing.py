@@ -76,8 +76,9 @@ def assert_matches_oracle(
     report = as_report(renderer, rows, {"left_out": list(left_out)})
     not_given = report.settings["not_given"]
     if report.n_failed:
+        looks_like = "".join(f"{line}\n" for line in report.settings["looks_like"])
         raise AssertionError(
-            f"{report.title}\n\n{as_markdown(report)}\n\nnot given: {', '.join(not_given) or 'nothing'}"
+            f"{report.title}\n\n{as_markdown(report)}\n\n{looks_like}not given: {', '.join(not_given) or 'nothing'}"
         )
     gradients = [stage for stage in STAGES if stage.startswith("v_")]
     if has_gradients and all(stage in not_given for stage in gradients):

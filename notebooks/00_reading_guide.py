@@ -167,6 +167,7 @@ notes = {
     "metrics": "metrics",
     "io": "files",
     "gsplat_compat": "gsplat's call",
+    "gsplat_arguments": "its arguments",
     "rendering": "from parameters to an image and back",
     "splatting": "one view of activated Gaussians",
     "backends": "one function for every stage",

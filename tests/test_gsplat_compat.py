@@ -158,7 +158,7 @@ def test_tile_lists_are_made_once_and_only_when_read(first, rng, monkeypatch):
 
     monkeypatch.setattr(minisplat_ref.gsplat_compat, "bin_gaussians", counted)
     _, _, meta = call(make_scene(rng), backend="cpu")
-    assert set(TILE_LISTS) < set(meta) and first in meta and first in meta.keys() and len(meta) == 14
+    assert set(TILE_LISTS) < set(meta) and first in meta and first in meta.keys() and len(meta) == 15
     assert first in repr(meta) and "isect_ids" not in meta and meta.get("isect_ids") is None
     assert meta["depths"].any() and meta["n_cameras"] == 2
     assert n_calls == 0

@@ -39,7 +39,7 @@ class Extension(NamedTuple):
     commands: tuple[ModuleType, ...] = ()
     """Modules with ``add_parser(commands)`` and ``run(args)``: ``minisplat-ref NAME COMMAND``."""
     stages: Callable[..., Any] | None = None
-    """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks."""
+    """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks, besides others."""
     sample: Callable[[Gaussians, np.random.Generator], Any] | None = None
     """Makes of any Gaussians a population that exercises the renderer, for ``bench --extension NAME``; by default the
     representation's ``extend``, which may leave them as they are."""

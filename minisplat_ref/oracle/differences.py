@@ -10,6 +10,7 @@ becomes ``h^6 f^(7) / 140``, and h can be a hundred times larger.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,12 @@ STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 """Steps to try: the first is best for values of order 1, the next are used only where the one before is refused."""
 
 
+SETTLED = 1e-6
+"""Relative difference of the derivatives from two steps, ten times apart, below which neither has met a threshold."""
+ROUNDINGS = 30.0
+"""Units in the last place by which a value may be off that sums hundreds of terms."""
+
+
 class Point(NamedTuple):
     """What a function under test returns."""
 
@@ -36,6 +43,8 @@ class Point(NamedTuple):
 
 Function = Callable[..., Point]
 Vjp = Callable[..., tuple[Floats, ...]]
+Differentiate = Callable[..., tuple[tuple[Floats, ...], float]]
+"""As :func:`careful_derivative`: a derivative along a direction, and the step that gave it."""
 
 
 class ThresholdCrossed(Exception):
@@ -160,6 +169,29 @@ def careful_derivative(
     raise ThresholdCrossed
 
 
+def settled_derivative(
+    function: Function, inputs: Sequence[Floats], index: int, direction: Floats, steps: Sequence[float] = STEPS
+) -> tuple[tuple[Floats, ...], float]:
+    """Return :func:`derivative` with the first of ``steps`` that the next smaller one confirms, and that step.
+
+    For functions that do not tell on which side of their thresholds they are: a kink or a jump inside the stencil
+    changes the two estimates by different amounts. They agree if they differ by less than ``SETTLED`` of the larger, or
+    by what rounding explains.
+    """
+    size = max(float(np.max(np.abs(output), initial=0)) for output in function(*inputs).outputs)
+    estimates = [derivative(function, inputs, index, direction, steps[0])]
+    for step, smaller in pairwise(steps):
+        estimates.append(derivative(function, inputs, index, direction, smaller))
+        noise = ROUNDINGS * float(np.finfo(np.float64).eps) * size / smaller
+        if all(_agree(a, b, noise) for a, b in zip(*estimates[-2:], strict=True)):
+            return estimates[-2], step
+    raise ThresholdCrossed
+
+
+def _agree(a: Floats, b: Floats, noise: float) -> bool:
+    return bool(np.max(np.abs(a - b), initial=0) <= SETTLED * np.max(np.abs(a), initial=0) + noise)
+
+
 def analytic_jacobians(vjp: Vjp, outputs: Sequence[Floats]) -> tuple[Floats, ...]:
     """Return derivatives [n_outputs, n_inputs] with respect to each input: one VJP for every entry of the outputs."""
     rows = []
@@ -179,6 +211,7 @@ def check_jacobians(
     names: Sequence[str],
     output_names: Sequence[str],
     steps: Sequence[float] = STEPS,
+    differentiate: Differentiate = careful_derivative,
 ) -> JacobianCheck:
     """Compare full Jacobians, block by block, so that a small block does not hide behind a large one.
 
@@ -194,6 +227,8 @@ def check_jacobians(
         Of the inputs and of the outputs.
     steps : sequence of float
         As for :func:`careful_derivative`.
+    differentiate : callable
+        :func:`careful_derivative`, or :func:`settled_derivative` for a function that does not tell its thresholds.
 
     Returns
     -------
@@ -210,7 +245,7 @@ def check_jacobians(
             direction = np.zeros_like(inputs[index])
             direction.flat[k] = 1
             try:
-                column, step = careful_derivative(function, inputs, index, direction, steps)
+                column, step = differentiate(function, inputs, index, direction, steps)
             except ThresholdCrossed:
                 n_refused += 1
                 continue
@@ -235,12 +270,13 @@ def check_inner_products(
     *,
     names: Sequence[str],
     steps: Sequence[float] = STEPS,
+    differentiate: Differentiate = careful_derivative,
 ) -> tuple[InnerProduct, ...]:
     """Compare <v, df(direction)> with <gradient, direction>, one random direction of each input by itself.
 
     Parameters
     ----------
-    function, vjp, inputs, names, steps
+    function, vjp, inputs, names, steps, differentiate
         As for :func:`check_jacobians`.
     rng : Generator
         For the cotangents v and the directions, whose entries are below 1.
@@ -257,7 +293,7 @@ def check_inner_products(
         direction = rng.uniform(-1, 1, size=inputs[index].shape)
         size = float(np.abs(gradient * direction).sum())
         try:
-            moved, step = careful_derivative(function, inputs, index, direction, steps)
+            moved, step = differentiate(function, inputs, index, direction, steps)
             error = abs(inner(cotangents, moved) - float(np.vdot(gradient, direction)))
         except ThresholdCrossed:
             error, step = np.inf, 0.0

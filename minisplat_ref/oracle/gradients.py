@@ -15,7 +15,13 @@ from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_1_5, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Report
-from minisplat_ref.oracle.differences import STEPS, check_inner_products, check_jacobians
+from minisplat_ref.oracle.differences import (
+    STEPS,
+    Differentiate,
+    careful_derivative,
+    check_inner_products,
+    check_jacobians,
+)
 from minisplat_ref.oracle.pieces import PIECES, SEED, tiny_setting
 from minisplat_ref.oracle.public_call import CALLS, Call, rasterization_stage
 from minisplat_ref.oracle.setting import make_setting
@@ -51,16 +57,21 @@ def check_all_gradients(backends: Sequence[Backend], conventions: Conventions) -
         The cases of all; their names begin with the backend's if there are several.
     """
     reports = [check_gradients(backend, conventions) for backend in backends]
-    if len(reports) == 1:
-        return reports[0]
     names = ", ".join(backend.name for backend in backends)
-    cases = tuple(
-        case._replace(name=f"{backend.name}: {case.name}")
-        for backend, report in zip(backends, reports, strict=True)
-        for case in report.cases
-    )
     settings = {**reports[0].settings, "backend": names}
+    cases = by_backend(backends, [report.cases for report in reports])
     return Report(f"gradients of {names}, profile {conventions.name}, float64", cases, settings)
+
+
+def by_backend(backends: Sequence[Backend], cases: Sequence[Sequence[Case]]) -> tuple[Case, ...]:
+    """Return the cases of several backends as one sequence; if there are several, names begin with the backend's."""
+    if len(backends) == 1:
+        return tuple(cases[0])
+    return tuple(
+        case._replace(name=f"{backend.name}: {case.name}")
+        for backend, own in zip(backends, cases, strict=True)
+        for case in own
+    )
 
 
 def check_gradients(backend: Backend, conventions: Conventions) -> Report:
@@ -105,11 +116,16 @@ def public_call_cases(backend: Backend, conventions: Conventions) -> list[Case]:
     return cases
 
 
-def jacobian_case(stage: Stage) -> Case:
-    """Compare full Jacobians of a stage, from its VJP and from differences."""
+def jacobian_case(stage: Stage, differentiate: Differentiate = careful_derivative) -> Case:
+    """Compare full Jacobians of a stage, from its VJP and from differences; see :func:`check_jacobians`."""
     inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
     check = check_jacobians(
-        stage.function, stage.vjp, inputs, names=list(stage.inputs), output_names=list(stage.outputs)
+        stage.function,
+        stage.vjp,
+        inputs,
+        names=list(stage.inputs),
+        output_names=list(stage.outputs),
+        differentiate=differentiate,
     )
     limit = _limit(check.step)
     problems = [f"d {block.output} / d {block.input} is wrong" for block in check.blocks if not block.error <= limit]
@@ -125,10 +141,15 @@ def jacobian_case(stage: Stage) -> Case:
     return _case(f"{stage.name}: Jacobian", stage, outputs, figures, problems)
 
 
-def inner_product_case(stage: Stage, rng: np.random.Generator) -> Case:
-    """Compare directional derivatives of a stage, one for each input."""
+def inner_product_case(
+    stage: Stage, rng: np.random.Generator, differentiate: Differentiate = careful_derivative
+) -> Case:
+    """Compare directional derivatives of a stage, one for each input; see :func:`check_inner_products`."""
     inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
-    products = check_inner_products(stage.function, stage.vjp, inputs, rng, names=list(stage.inputs), steps=MANY_STEPS)
+    names = list(stage.inputs)
+    products = check_inner_products(
+        stage.function, stage.vjp, inputs, rng, names=names, steps=MANY_STEPS, differentiate=differentiate
+    )
     problems = [f"{p.input}: every step crosses a threshold" for p in products if p.step == 0]
     problems += [f"the gradient with respect to {p.input} is zero" for p in products if p.size <= GRADIENT_FLOOR]
     problems += [

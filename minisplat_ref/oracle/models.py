@@ -39,6 +39,8 @@ def check_model_gradients(
 ) -> Report:
     """Check the renderer of a representation, and further stages.
 
+    :func:`minisplat_ref.oracle.relatives.check_relative_gradients` checks all that an extension has of its own.
+
     Parameters
     ----------
     backend : Backend
@@ -55,19 +57,27 @@ def check_model_gradients(
     Report
         A case for each stage and way of checking.
     """
+    cases = model_cases(backend, conventions, representation, stages)
+    settings = {"backend": backend.name, "profile": conventions.name, "dtype": "float64", "seed": SEED, "time": TIME}
+    title = f"gradients of {representation.name} on {backend.name}, profile {conventions.name}, float64"
+    return Report(title, tuple(cases), settings)
+
+
+def model_cases(
+    backend: Backend, conventions: Conventions, representation: Representation | None, stages: Stages | None
+) -> list[Case]:
+    """Return the cases of a renderer, where there is one, and of further stages; see :func:`check_model_gradients`."""
     rng = np.random.default_rng(SEED)
     tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
 
     def all_stages(setting: Setting) -> tuple[Stage, ...]:
-        whole = model_stage(backend, setting, representation, rng)
+        whole = () if representation is None else (model_stage(backend, setting, representation, rng),)
         further = () if stages is None else tuple(stages(backend, setting, rng))
-        return further if whole.name in {stage.name for stage in further} else (whole, *further)
+        names = {stage.name for stage in further}
+        return (*(stage for stage in whole if stage.name not in names), *further)
 
     cases: list[Case] = [jacobian_case(stage) for stage in all_stages(tiny)]
-    cases += [inner_product_case(stage, rng) for stage in all_stages(larger)]
-    settings = {"backend": backend.name, "profile": conventions.name, "dtype": "float64", "seed": SEED, "time": TIME}
-    title = f"gradients of {representation.name} on {backend.name}, profile {conventions.name}, float64"
-    return Report(title, tuple(cases), settings)
+    return cases + [inner_product_case(stage, rng) for stage in all_stages(larger)]
 
 
 def model_stage(backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator) -> Stage:
@@ -87,9 +97,8 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
     rng : Generator
         For the noise.
     """
-    renderer, view = representation.renderer, _view(setting.camera)
-    population = _noisy_population(setting.gaussians, representation, rng)
-    shared = {name: _noisy(array, rng) for name, array in representation.shared(_scene(setting, view), rng).items()}
+    renderer, view = representation.renderer, training_view(setting.camera)
+    (population, shared), _ = noisy_model(setting, view, representation, rng)
     fields = population._asdict()
     wants = frozenset({"depth"} & renderer.channels(frozenset({"depth"})).keys())
     held = {name: fields[name] for name, rate in representation.rates.of.items() if rate == 0 and name in fields}
@@ -128,6 +137,30 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
     return Stage(f"render {representation.name}", inputs, ("image", "alpha"), function, vjp)
 
 
+def noisy_model(
+    setting: Setting, view: View, representation: Representation, rng: np.random.Generator
+) -> tuple[Model, Scene]:
+    """Return the Gaussians as a model of the representation, with noise in what is its own, and the scene of the view.
+
+    Parameters
+    ----------
+    setting : Setting
+        Its Gaussians become the population; those of 3DGS stay where they are.
+    view : View
+        The scene's only one.
+    representation : Representation
+        Makes the population and the shared parameters.
+    rng : Generator
+        For both, and for the noise.
+    """
+    points = setting.gaussians.means[:N_POINTS]
+    colors = np.full(points.shape, 128, np.uint8)
+    scene = Scene("tiny", (view,), (), points, colors, setting.background, extent=1.0)
+    population = _noisy_population(setting.gaussians, representation, rng)
+    shared = {name: _noisy(array, rng) for name, array in representation.shared(scene, rng).items()}
+    return Model(population, shared), scene
+
+
 def _noisy_population(gaussians: Gaussians, representation: Representation, rng: np.random.Generator) -> Any:
     """Turn the Gaussians into a population, and add noise to its further fields."""
     population = representation.extend(gaussians, rng)
@@ -142,12 +175,6 @@ def _noisy(array: Floats, rng: np.random.Generator) -> Floats:
     return array + NOISE * rng.normal(size=array.shape)
 
 
-def _view(camera: Camera) -> View:
+def training_view(camera: Camera) -> View:
     """Return a training view at TIME, of a black photograph."""
     return View("a", camera, np.zeros((camera.height, camera.width, 3), np.uint8), None, view_id=0, time=TIME)
-
-
-def _scene(setting: Setting, view: View) -> Scene:
-    """Return a scene of one view, from which to initialise shared parameters."""
-    points = setting.gaussians.means[:N_POINTS]
-    return Scene("tiny", (view,), (), points, np.full(points.shape, 128, np.uint8), setting.background, extent=1.0)

@@ -2,7 +2,8 @@
 
 A mechanism is removed by a setting or by leaving out its event; everything else, including all dates, stays. A row
 about a mechanism that never acts would be meaningless. So there is none if it has no date at this length, or did not
-fire in the full training according to its record of events: small photographs, for example, are never halved. The study
+fire in the full training according to its record of events: small photographs, for example, are never halved. Nor is
+there one if the training without it is the full training to the last digit: it fired, but did nothing. The study
 can do the same for our own deviations from the published method (``docs/FIDELITY.md``).
 
 Trainings take long. Each writes its record to ``runs.jsonl`` as soon as it ends, and the same command with the same
@@ -40,7 +41,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     Raises
     ------
     InputError
-        The scene, a recipe or the output folder cannot be used.
+        The scene, a recipe or the output folder cannot be used, or no mechanism acted.
     """
     scene = kit.read_scene(args.scene, args.downscale)
     published, rules = get_recipe(args.recipe), DEVIATIONS if args.deviations else MECHANISMS
@@ -60,12 +61,17 @@ def run(args: argparse.Namespace) -> kit.Report:
     records = [record for record in records if record["seed"] in args.seeds]
     acts = count_actions(records, variants)
     idle = [name for name, n in acts.items() if n == 0]
-    summary = differences([record for record in records if record["without"] not in idle])
+    if len(idle) == len(variants) - 1:
+        raise InputError(f"nothing that can be taken out ever acted ({', '.join(idle)}): {kit.REMEDY}")
+    records_of_acting = [record for record in records if record["without"] not in idle]
+    names, alike = kit.leave_out_idle(kit.arms_of(records_of_acting, "without", ("psnr", "ssim", "n_gaussians")))
+    summary = differences([record for record in records if record["without"] in names])
     result = {**description, **settings, "seeds": list(args.seeds), "acts": acts, "summary": summary, "runs": records}
     length = f"{recipe.name}, {recipe.iterations} iterations"
     table = markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result))
     text = f"{kit.title(description)}\n{length}, condition {args.condition}, {kit.seeds_of(args)}\n\n{table}"
     text += f"\n\nnever acted, so that nothing can be said of it: {', '.join(idle)}" if idle else ""
+    text += alike
     return kit.Report(result, draw(summary), text)
 
 

@@ -63,7 +63,9 @@ def run(args: argparse.Namespace) -> kit.Report:
     costs = ("ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)")
     text = f"{RECIPE}, {args.iterations} iterations, seed {args.seed}, {args.repeats} timed"
     table = markdown_table(["", *counts, *costs], to_rows(found))
-    return kit.Report(result, draw(rows), f"{kit.title(result)}\n{text}\n\n{table}")
+    views = [row["views"][name] for row in found.values() for name in ("gaussians", "tile_pairs")]
+    arms = {arm: np.concatenate(views)[:, k] for k, arm in enumerate(("without culling", "with culling"))}
+    return kit.Report(result, draw(rows), f"{kit.title(result)}\n{text}\n\n{table}", arms)
 
 
 def resume_from(state: TrainState, gaussians: Gaussians, step: int) -> None:

@@ -116,11 +116,12 @@ def run(args: argparse.Namespace) -> kit.Report:
     ]
     guards = {"min_alpha": ALPHA_MIN, "depth_tolerance": DEPTH_TOLERANCE, "backdrop_extents": BACKDROP_EXTENTS}
     settings = {"recipe": recipe.name, "iterations": args.iterations, "seeds": list(args.seeds), **guards}
-    summary = summarise(runs, "choice", METRICS)
+    acting, alike = kit.leave_out_idle(kit.arms_of(runs, "choice", list(METRICS)))
+    summary = summarise([run for run in runs if run["choice"] in acting], "choice", METRICS)
     result = {**kit.describe_scene(truth.scene), **settings, "summary": summary, "runs": runs}
     length = f"{recipe.name}, {args.iterations} iterations, reinitialised at {' and '.join(map(str, steps))}"
     table = markdown_table(["points", *METRICS.values()], to_rows(summary))
-    return kit.Report(result, draw(summary), f"{kit.title(result)}\n{length}; {kit.seeds_of(args)}\n\n{table}")
+    return kit.Report(result, draw(summary), f"{kit.title(result)}\n{length}; {kit.seeds_of(args)}\n\n{table}{alike}")
 
 
 def measure(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) -> dict[str, float | None]:

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     description, heading = recovery.describe(args, scene)
     rows = [[arm, f"{np.mean(row['levels']):.2f}", f"{row['psnr']:.2f}"] for arm, row in arms.items()]
     table = markdown_table(["training", "maps off by (levels of 255)", "held-out PSNR (dB)"], rows)
-    return kit.Report({**description, "arms": arms}, draw(arms), f"{heading}\n\n{table}")
+    return kit.Report({**description, "arms": arms}, draw(arms), f"{heading}\n\n{table}", recovery.compared(arms))
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARMS) -> dict[str, dict[str, Any]]:

@@ -215,11 +215,15 @@ def run(args: argparse.Namespace) -> kit.Report:
         lambda missing: warm_up(first[0], recipes.values() if missing else ()),
     )
     records = [r for r in records if r["scene"] in scenes and r["recipe"] in recipes and r["seed"] in args.seeds]
+    measures = [{**r, "psnr": [photograph["psnr"] for photograph in r["photographs"]]} for r in records]
+    names, alike = kit.leave_out_idle(kit.arms_of(measures, "recipe", ("psnr", "n_gaussians")))
+    measured, records = records, [r for r in records if r["recipe"] in names]
+    recipes = {text: recipe for text, recipe in recipes.items() if text in names}
     rows = [summarise(records, scene, recipe) for scene in scenes for recipe in recipes]
     description = describe_machine()
-    result = {**settings, "machine": description, "seeds": list(args.seeds), "summary": rows, "runs": records}
+    result = {**settings, "machine": description, "seeds": list(args.seeds), "summary": rows, "runs": measured}
     text = f"{args.folds} folds, long side at most {args.long_side} pixels, {kit.seeds_of(args)}; {description}\n\n"
-    text += to_table(rows)
+    text += to_table(rows) + alike
     if len(recipes) > 1:
         text += "\n\n" + describe_differences(records, list(recipes))
         text += "\n\n" + leave_one_scene_out(records, list(recipes))

@@ -27,7 +27,7 @@ from minisplat_ref.reporting import describe_machine
 from minisplat_ref.reports.palette import PNG_DPI
 from minisplat_ref.studies.figures import STYLE
 from minisplat_ref.studies.study import FIGURE, RESULT
-from minisplat_ref.types import Camera, Floats, Gaussians, Scene
+from minisplat_ref.types import NOTHING, Camera, Floats, Gaussians, Scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.training.state import TrainState
 
+REMEDY = "give more iterations, larger photographs or another scene, with which it acts"
 RUNS = "runs.jsonl"  # what has been measured so far, below the settings
 Item = TypeVar("Item")
 
@@ -47,6 +48,9 @@ class Report(NamedTuple):
     figure: "Figure"
     text: str
     """For the terminal: tables in Markdown, with a line about each."""
+    arms: Mapping[str, Any] = NOTHING
+    """What was measured with each choice, by its name. Two that agree in every digit are refused
+    (:func:`refuse_idle`); empty where no choices are compared, or where equal outcomes are a result."""
 
 
 def carry_out(measure: Callable[[argparse.Namespace], Any], args: argparse.Namespace, *, is_resumed: bool) -> None:
@@ -60,6 +64,11 @@ def carry_out(measure: Callable[[argparse.Namespace], Any], args: argparse.Names
     is_resumed : bool
         The folder may be there, with the records of an earlier call; otherwise it is new, and not there if the study
         fails.
+
+    Raises
+    ------
+    InputError
+        What is compared did not act; see :func:`refuse_idle`.
     """
     if "out" not in args:
         print(measure(args))
@@ -68,9 +77,75 @@ def carry_out(measure: Callable[[argparse.Namespace], Any], args: argparse.Names
 
     with rc_context(STYLE), contextlib.nullcontext(args.out) if is_resumed else making_folder(args.out) as folder:
         report = measure(args)
+        refuse_idle(report.arms)
         (folder / RESULT).write_text(json.dumps(report.result, indent=2) + "\n", encoding="utf-8")
         report.figure.savefig(folder / FIGURE, dpi=PNG_DPI, facecolor="white")
     print(report.text)
+
+
+def find_idle(arms: Mapping[str, Any]) -> dict[str, str]:
+    """Return the arms that measure exactly what one before does, with its name: what distinguishes them did not act.
+
+    Parameters
+    ----------
+    arms : mapping
+        What was measured by name, as lists, mappings and numbers; seconds are not compared. Trainings that differ in
+        anything never agree in every digit.
+    """
+    firsts: dict[str, str] = {}
+    idle = {}
+    for name, arm in arms.items():
+        first = firsts.setdefault(json.dumps(_without_seconds(arm), sort_keys=True, default=float), name)
+        if first != name:
+            idle[name] = first
+    return idle
+
+
+def _without_seconds(measured: Any) -> Any:
+    if isinstance(measured, Mapping):
+        return {str(key): _without_seconds(value) for key, value in measured.items() if key != "seconds"}
+    if isinstance(measured, list | tuple | np.ndarray):
+        return [_without_seconds(value) for value in measured]
+    return measured
+
+
+def refuse_idle(arms: Mapping[str, Any]) -> None:
+    """Refuse to report a comparison in which an arm is another one again.
+
+    Raises
+    ------
+    InputError
+        :func:`find_idle` finds one.
+    """
+    if idle := find_idle(arms):
+        raise InputError(f"{_in_words(idle)}; {REMEDY}")
+
+
+def leave_out_idle(arms: Mapping[str, Any]) -> tuple[list[str], str]:
+    """Return the names of the arms without those that did not act, and a paragraph about these; empty if all acted.
+
+    Raises
+    ------
+    InputError
+        None but the first acted.
+    """
+    idle = find_idle(arms)
+    if idle and len(idle) == len(arms) - 1:
+        refuse_idle(arms)
+    return [name for name in arms if name not in idle], f"\n\n{_in_words(idle)}" if idle else ""
+
+
+def _in_words(idle: Mapping[str, str]) -> str:
+    pairs = ", ".join(f"{name!r} measured exactly what {first!r} did" for name, first in idle.items())
+    return f"{pairs}: what distinguishes them did not act, and nothing can be said of it"
+
+
+def arms_of(records: Iterable[Mapping[str, Any]], key: str, measures: Sequence[str]) -> dict[str, Any]:
+    """Return for each value of ``key`` the measures of its records, in their order."""
+    arms: dict[str, Any] = {}
+    for record in records:
+        arms.setdefault(record[key], []).append([record[measure] for measure in measures])
+    return arms
 
 
 def settings_of(args: argparse.Namespace, *names: str) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> kit.Report:
         ["training", "angle (degrees)", "centre (% of extent)", "points (px)", "held-out PSNR (dB)"], rows
     )
     result = {**description, **disturbance._asdict(), "extent": scene.extent, "arms": arms}
-    return kit.Report(result, draw(arms), f"{heading}\n\n{table}")
+    return kit.Report(result, draw(arms), f"{heading}\n\n{table}", recovery.compared(arms))
 
 
 def measure(

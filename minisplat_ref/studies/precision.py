@@ -92,7 +92,8 @@ def run(args: argparse.Namespace) -> kit.Report:
     result = {**description, **settings, "seeds": list(args.seeds), "summary": rows, "runs": records}
     length = f"{args.recipe}, {args.iterations} iterations, {kit.seeds_of(args)}"
     table = markdown_table(HEADING, [_cells(name, row) for name, row in rows.items()])
-    return kit.Report(result, draw(rows), f"{kit.title(description)}\n{length}\n\n{table}")
+    arms = kit.arms_of(records, "precision", ("psnr", "ssim", "n_gaussians"))
+    return kit.Report(result, draw(rows), f"{kit.title(description)}\n{length}\n\n{table}", arms)
 
 
 def train_in_precision(scene: Scene, recipe: Recipe, precision: Precision, seed: int) -> TrainState:

@@ -39,6 +39,11 @@ def describe(args: argparse.Namespace, scene: Scene) -> tuple[dict[str, Any], st
     return description, f"{kit.title(description)}\n{RECIPE}, {args.iterations} iterations, seed {args.seed}"
 
 
+def compared(arms: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return what must differ: neither the disturbance nor its correction may have done nothing."""
+    return {arm: row["psnr"] for arm, row in arms.items()}
+
+
 def draw_errors(axes: Axes, arms: dict[str, dict[str, Any]], measure: str) -> None:
     """Draw the error of each photograph, disturbed and calibrated."""
     before, after = (arms[arm][measure] for arm in ARMS[1:])

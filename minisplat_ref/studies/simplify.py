@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     }
     result = {**kit.describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}
     text = f"{kit.title(result)}\n{describe_dense(result)}\n\n{markdown_table(*to_table(result))}"
-    return kit.Report(result, draw(result), text)
+    return kit.Report(result, draw(result), text, kit.arms_of(runs, "choice", ("psnr", "psnr_tuned")))
 
 
 def true_surface(source: str) -> dict[str, Floats]:

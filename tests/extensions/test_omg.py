@@ -8,7 +8,7 @@ import zstandard
 from numpy.testing import assert_allclose, assert_array_equal
 
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
-from minisplat_ref import load_ply
+from minisplat_ref import load_ply, load_scene, save_ply
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -19,6 +19,7 @@ from minisplat_ref.extensions.omg.appearance import features_of, fit_decoder
 from minisplat_ref.extensions.omg.method import prune_indistinct
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.omg.svq import fit_codes, quantise
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import indoor
@@ -326,8 +327,11 @@ def test_train_convert_draw_and_measure(folders, tmp_path, capsys):
 
 def test_study(folders, tmp_path, capsys):
     nook, run = folders
-    options = ["--fine-tune", "3", "--out", str(tmp_path / "out")]
-    assert main(["study", "omg/distinctiveness", str(nook), "--ply", str(run / "point_cloud.ply"), *options]) == 0
+    command = ["study", "omg/distinctiveness", str(nook), "--fine-tune", "3", "--out", str(tmp_path / "out"), "--ply"]
+    assert main([*command, str(run / "point_cloud.ply")]) == 2  # of five Gaussians both choices keep the same
+    assert "'with distinctiveness' measured exactly what 'importance' did" in capsys.readouterr().err
+    save_ply(tmp_path / "more.ply", initial_state(load_scene(nook), get_recipe("3dgs"), seed=0).gaussians)
+    assert main([*command, str(tmp_path / "more.ply")]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     rows = result["runs"][0]
     assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]

@@ -281,7 +281,8 @@ def test_the_other_commands_know_it(stranger, run_folder):
     assert stranger.run("study", "glow/count", "--what", "sheep") == "counted sheep\n"
     assert "glow/count" in stranger.run("extensions", "glow")
     for backend in ("reference", "cpu"):
-        assert "all 2 cases passed" in stranger.run("oracle", "gradients", "--extension", "glow", "--backend", backend)
+        said = stranger.run("oracle", "gradients", "--extension", "glow", "--backend", backend)
+        assert "all 4 cases passed" in said and "loss term glow_penalty: Jacobian" in said
 
 
 def test_its_ply_is_one_of_3dgs(run_folder):

@@ -9,7 +9,7 @@ from minisplat_ref import gsplat_compat
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
-from minisplat_ref.gsplat_compat import RENDER_MODES
+from minisplat_ref.gsplat_arguments import RENDER_MODES
 from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.differences import (
     CENTRAL,
@@ -20,6 +20,7 @@ from minisplat_ref.oracle.differences import (
     check_inner_products,
     check_jacobians,
     derivative,
+    settled_derivative,
 )
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import PIECES, tiny_setting
@@ -260,3 +261,23 @@ def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys):
     monkeypatch.setattr(gradients, "public_call_cases", lambda *args: [])
     assert main(["oracle", "gradients", "--backend", "cpu"]) == 1
     assert "is wrong" in capsys.readouterr().out
+
+
+# --- thresholds that a function does not tell ---
+
+
+def test_a_derivative_settles_beside_a_kink():
+    def kinked(x):  # slope 1, from 1 + 2e-5 on 3
+        return Point((x + 2 * np.maximum(x - (1 + 2e-5), 0),))
+
+    (got,), used = settled_derivative(kinked, [ONE], 0, ONE)
+    assert used == 1e-6 and abs(got[0] - 1) < GRADIENT_REL
+
+
+@pytest.mark.parametrize("at", [1.0, 1 + 1e-10])
+def test_a_derivative_on_a_kink_does_not_settle(at):
+    def kinked(x):
+        return Point((np.maximum(x - at, 0) ** 0.5,))
+
+    with pytest.raises(ThresholdCrossed):
+        settled_derivative(kinked, [ONE], 0, ONE)

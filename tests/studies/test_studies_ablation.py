@@ -177,17 +177,44 @@ def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
 
 def test_what_has_not_fired_has_no_row(tmp_path, capsys, small, monkeypatch):
     """Photographs of 48 x 36 pixels are never halved, though the recipe has a date until which they should be."""
-    name = "half-size warm-up"
-    monkeypatch.setattr(ablation, "MECHANISMS", {name: MECHANISMS[name]})
+    names = ("half-size warm-up", "last prune")
+    monkeypatch.setattr(ablation, "MECHANISMS", {name: MECHANISMS[name] for name in names})
     monkeypatch.setattr(conditions, "FEW", 2)
     out = tmp_path / "out"
     command = ["study", "ablation", "room", "--out", str(out), "--recipe", "mini-splatting2", "--condition", "few"]
     assert main([*command, "--iterations", "12", "--seeds", "0"]) == 0
     printed = capsys.readouterr().out
     assert "room, 4 training views" in printed and "12 iterations, condition few" in printed
-    assert f"never acted, so that nothing can be said of it: {name}" in printed and f"- {name}" not in printed
+    assert f"never acted, so that nothing can be said of it: {names[0]}" in printed and f"- {names[0]}" not in printed
     result = json.loads((out / RESULT).read_text())
-    assert set(result["summary"]) == {FULL} and result["acts"] == {name: 0}
+    assert set(result["summary"]) == {FULL, names[1]} and result["acts"] == {names[0]: 0, names[1]: 1}
+
+
+def test_a_study_of_what_has_not_fired_is_refused(tmp_path, capsys, small, monkeypatch):
+    monkeypatch.setattr(ablation, "MECHANISMS", {"half-size warm-up": MECHANISMS["half-size warm-up"]})
+    out = tmp_path / "out"
+    command = ["study", "ablation", "room", "--out", str(out), "--recipe", "mini-splatting2"]
+    assert main([*command, "--iterations", "12", "--seeds", "0"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and "nothing that can be taken out ever acted (half-size warm-up): give more iter" in said.err
+    assert not (out / RESULT).exists()
+
+
+def test_what_has_fired_without_effect_has_no_row(tmp_path, capsys, small, monkeypatch):
+    """No Gaussian of these photographs has the area from which on blur is split: the four rows were equal."""
+    forms = ("blur split", "random children", "blur split and random children")
+    command = ["study", "ablation", "room", "--recipe", "mini-splatting", "--iterations", "400", "--seeds", "0"]
+    monkeypatch.setattr(ablation, "MECHANISMS", {name: MECHANISMS[name] for name in forms})
+    assert main([*command, "--out", str(tmp_path / "three")]) == 0
+    printed = capsys.readouterr().out
+    assert (
+        f"{forms[0]!r} measured exactly what {FULL!r} did, {forms[2]!r} measured exactly what {forms[1]!r}" in printed
+    )
+    assert f"- {forms[1]} " in printed and "| - blur split" not in printed
+    monkeypatch.setattr(ablation, "MECHANISMS", {forms[0]: MECHANISMS[forms[0]]})
+    assert main([*command, "--out", str(tmp_path / "one")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and f"{forms[0]!r} measured exactly what {FULL!r} did: what distinguishes" in said.err
 
 
 def test_bad_input_is_one_line(tmp_path, capsys, small):

@@ -41,6 +41,9 @@ averaged in. In the scenes of equality nothing is set aside: values equal their
 thresholds in binary, and in float64 nothing rounds. (Ours are left out there in
 float32.) Boxes and tile lists that differ without changing the image are
 harmless.
+
+Where something diverges, the three planted faults that look most like it are
+named, and what else to return to tell them apart.
 """
 EPILOG = """\
 columns: largest and RMS error; the largest as a part of the largest value of
@@ -128,6 +131,8 @@ def run(args: argparse.Namespace) -> int:
     }
     report = as_report(renderer, rows, settings)
     code = publish(report, args)
+    for line in report.settings["looks_like"]:
+        print(line)
     if report.settings["not_given"]:
         print(f"not given: {', '.join(report.settings['not_given'])}")
     if left_out:

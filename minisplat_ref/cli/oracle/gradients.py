@@ -1,11 +1,15 @@
 """``oracle gradients``: checks that every gradient is the derivative of what is computed."""
 
 import argparse
+from typing import TYPE_CHECKING
 
 from minisplat_ref.arguments import BACKENDS as NAMES
 from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+
+if TYPE_CHECKING:
+    from minisplat_ref.backends import Backend
 
 DESCRIPTION = """\
 Check the gradient of every stage, of the whole render and of rasterization in
@@ -17,15 +21,17 @@ every mode, for every backend, in float64:
 
 A difference across a threshold is refused, and a check of nothing fails.
 
-With --extension NAME the extension's whole renderer is checked with respect to
-every field of its population and every shared parameter, at time 0.7, and so
-are its own stages; by the reference unless --backend names another.
+With --extension NAME everything that the extension has of its own is checked,
+for every backend: its whole renderer with respect to every field of its
+population and every shared parameter, at time 0.7; its loss terms and those of
+its recipes, whatever their weight; and the stages that it names. An extension
+that has nothing of its own to check fails.
 """
 EPILOG = """\
 examples:
   minisplat-ref oracle gradients
   minisplat-ref oracle gradients --backend reference --profile INRIA
-  minisplat-ref oracle gradients --extension velocity --backend cpu
+  minisplat-ref oracle gradients --extension velocity
 """
 
 
@@ -56,25 +62,25 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check, print the table."""
-    from minisplat_ref.backends import BACKENDS, get_backend
-
     if args.extension is not None:
         return _check_extension(args)
     from minisplat_ref.oracle.gradients import AUTOGRAD, check_all_gradients
 
-    backends = tuple(BACKENDS.values()) if args.backend is None else (get_backend(args.backend),)
-    report = check_all_gradients(backends, PROFILES[args.profile])
+    report = check_all_gradients(_backends(args), PROFILES[args.profile])
     print(f"{AUTOGRAD}: {report.settings[AUTOGRAD]}")
     return publish(report, args)
 
 
 def _check_extension(args: argparse.Namespace) -> int:
-    from minisplat_ref.backends import get_backend
     from minisplat_ref.extensions.extension import load_extension
-    from minisplat_ref.oracle.models import check_model_gradients
+    from minisplat_ref.oracle.relatives import Relative, check_relative_gradients
 
-    extension = load_extension(args.extension)
-    report = check_model_gradients(
-        get_backend(args.backend or "reference"), PROFILES[args.profile], extension.representation, extension.stages
-    )
-    return publish(report, args)
+    e = load_extension(args.extension)
+    relative = Relative(e.name, e.representation, e.losses, e.recipes, e.stages)
+    return publish(check_relative_gradients(_backends(args), PROFILES[args.profile], relative), args)
+
+
+def _backends(args: argparse.Namespace) -> "tuple[Backend, ...]":
+    from minisplat_ref.backends import BACKENDS, get_backend
+
+    return tuple(BACKENDS.values()) if args.backend is None else (get_backend(args.backend),)

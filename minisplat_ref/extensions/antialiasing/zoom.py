@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
     result |= {"zooms": found.zooms, "psnr": found.psnr, "counts": found.counts}
     text = f"PSNR (dB) of test views: mean over the seeds ± half their range\n\n{table}"
-    return kit.Report(result, draw(found), text)
+    return kit.Report(result, draw(found), text, arms=found.psnr)
 
 
 def draw(found: Measured) -> Figure:

@@ -28,7 +28,8 @@ def run(args: argparse.Namespace) -> kit.Report:
     rows, images = outcomes(args.iterations, args.seeds)
     result = {**kit.settings_of(args, "iterations", "seeds"), "rows": rows}
     heading = ["image", "Gaussians", "number", "floats", "PSNR", "best", "at the edge", "elsewhere", "10-90 % (px)"]
-    return kit.Report(result, draw(rows, images), markdown_table(heading, [to_line(row) for row in rows]))
+    arms = kit.arms_of([row for row in rows if row["n_gaussians"] in NUMBERS["cut"]], "kind", ("psnr",))
+    return kit.Report(result, draw(rows, images), markdown_table(heading, [to_line(row) for row in rows]), arms)
 
 
 def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:

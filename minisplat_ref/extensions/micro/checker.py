@@ -204,7 +204,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     table = markdown_table(["variant", *NUMBERS.values()], rows)
     result = {**kit.settings_of(args, "iterations", "seeds", "beta", "trace"), "variants": found}
     text = f"mean over the seeds ± half their range\n\n{table}"
-    return kit.Report(result, draw(outcomes, args.beta, args.trace), text)
+    return kit.Report(result, draw(outcomes, args.beta, args.trace), text, arms=found)
 
 
 def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figure:

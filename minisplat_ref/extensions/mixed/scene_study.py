@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> kit.Report:
     rows = [row for scene in scenes for row in outcomes(scene, args.iterations, args.seeds)]
     result = {**kit.settings_of(args, "iterations", "seeds", "downscale"), "rows": rows, "machine": describe_machine()}
     heading = ["scene", "primitives", "number", "floats", "ellipses, lines, triangles", "test PSNR", "test SSIM"]
-    return kit.Report(result, draw(rows), markdown_table(heading, [to_line(row) for row in rows]))
+    arms = kit.arms_of(rows, "primitives", ("psnr", "ssim"))
+    return kit.Report(result, draw(rows), markdown_table(heading, [to_line(row) for row in rows]), arms)
 
 
 def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]]:

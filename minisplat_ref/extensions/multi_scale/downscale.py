@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
     result |= {"blocks": found.blocks, "counts": found.counts, "figures": by_name}
     text = "PSNR (dB) of test views, and thousands of pairs and of hits per view: means over the seeds"
-    return kit.Report(result, draw(found), f"{text}\n\n{table}")
+    return kit.Report(result, draw(found), f"{text}\n\n{table}", arms=by_name)
 
 
 def _sizes(found: Measured) -> list[str]:

@@ -171,7 +171,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     for pair, others in crossed.items():
         places = [f"{name} at {', '.join(f'{x:.2f}' for x in xs) or 'no thickness'}" for name, xs in others.items()]
         text += f"\n{pair}: crosses {'; '.join(places)}"
-    return kit.Report(result, draw(fits), text)
+    return kit.Report(result, draw(fits), text, arms=psnrs)
 
 
 def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:

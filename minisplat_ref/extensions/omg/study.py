@@ -65,7 +65,8 @@ def run(args: argparse.Namespace) -> kit.Report:
         for field, of_levels in losses.items()
     ]
     text += markdown_table(["field", *map(str, range(len(OMG_FILE.levels)))], rows)
-    return kit.Report(result, draw(result), text)
+    arms = kit.arms_of([row for rows in runs for row in rows if row["choice"]], "choice", ("at_once", "tuned"))
+    return kit.Report(result, draw(result), text, arms)
 
 
 def measure(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:

@@ -42,7 +42,8 @@ def run(args: argparse.Namespace) -> kit.Report:
     result = {**kit.describe_trainings(args, scene), "fine_tune": args.fine_tune, "runs": runs}
     heading = ["Gaussians", "with", "degree", "number", "floats", "test PSNR", "test SSIM", "training PSNR"]
     text = f"{scene.name}; fine-tuned {args.fine_tune} iterations\n\n{markdown_table(heading, to_rows(runs))}"
-    return kit.Report(result, draw(result), text)
+    arms = {f"{row['form']}, {row['kept']}, degree {row['degree']}": row for rows in runs[:1] for row in rows}
+    return kit.Report(result, draw(result), text, {name: row["psnr"] for name, row in arms.items()})
 
 
 def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:

@@ -108,9 +108,11 @@ def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
 
 def run(args: argparse.Namespace) -> str:
     """Train both recipes, and return a table."""
-    truth, rows = make_moving_gaussians(np.random.default_rng(args.seed)), []
+    truth, rows, arms = make_moving_gaussians(np.random.default_rng(args.seed)), [], {}
     recipes = (GS_ACCEL, VELOCITY._replace(representation=MOVING))
     for recipe in kit.with_progress(recipes, "trainings"):
         psnr, error = outcome(scale_recipe(recipe, args.iterations), truth, args.seed)
         rows.append([recipe.name, f"{psnr:.2f}", f"{error:.4f}"])
+        arms[recipe.name] = psnr
+    kit.refuse_idle(arms)
     return markdown_table(["recipe", "PSNR dB", "error of velocities"], rows)

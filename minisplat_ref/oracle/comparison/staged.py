@@ -13,9 +13,18 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.comparison.doubts import doubts
 from minisplat_ref.oracle.comparison.measures import Bounds, Difference, compare_bounds, compare_lists, difference
+from minisplat_ref.oracle.comparison.signatures import (
+    GRADIENTS,
+    INTERMEDIATE,
+    Mark,
+    in_words,
+    likeliest,
+    mark,
+    signature,
+)
 from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, Golden, names_of
 from minisplat_ref.oracle.renderer import ComparedRenderer
-from minisplat_ref.types import Bools
+from minisplat_ref.types import NOTHING, Bools
 
 Status = Literal["agrees", "diverges", "harmless", "not given"]
 
@@ -82,6 +91,8 @@ class Row(NamedTuple):
     """Names of those that diverge."""
     note: str = ""
     """One line."""
+    marks: Mapping[str, Mark] = NOTHING
+    """What is wrong with each array that was given."""
 
 
 def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
@@ -193,12 +204,13 @@ def _check_shapes(renderer: ComparedRenderer, given: Arrays, truth: Golden) -> N
 def _row_of_bounds(scene: str, stage: str, bounds: Bounds | None) -> Row:
     if bounds is None:
         return Row(scene, stage, "not given", None)
+    marks = {STAGES[stage][0]: Mark(bounds.changes_image)}
     if bounds.n_different == 0:
-        return Row(scene, stage, "agrees", None, bounds)
+        return Row(scene, stage, "agrees", None, bounds, marks=marks)
     if bounds.changes_image:
         note = f"{bounds.note}; the image changes"
-        return Row(scene, stage, "diverges", None, bounds, note=note, arrays=STAGES[stage])
-    return Row(scene, stage, "harmless", None, bounds, note=f"{bounds.note}; same image")
+        return Row(scene, stage, "diverges", None, bounds, note=note, arrays=STAGES[stage], marks=marks)
+    return Row(scene, stage, "harmless", None, bounds, note=f"{bounds.note}; same image", marks=marks)
 
 
 def _row_of_arrays(
@@ -212,7 +224,7 @@ def _row_of_arrays(
     found = [name for name in names if name in given]
     if not found:
         return Row(truth.name, stage, "not given", None)
-    differences = {}
+    differences, marks = {}, {}
     for name in found:
         a, b = given[name], truth.arrays[name]
         if name in BY_ROW:
@@ -221,7 +233,8 @@ def _row_of_arrays(
                 rows = rows & (given["radii"].reshape(len(rows), -1)[:, 0] > 0)
             a, b = a[rows], b[rows]
         tolerance = SPECS[name].tolerance.of(renderer.dtype or given[name].dtype)
-        differences[name] = difference(a, b, tolerance, may_flip.get(name))
+        d = differences[name] = difference(a, b, tolerance, may_flip.get(name))
+        marks[name] = mark(a, b, is_wrong=d.n_over > 0, set_aside=may_flip.get(name))
     worst = max(differences, key=lambda name: differences[name].excess)
     d = differences[worst]
     notes = [worst if len(names) > 1 and d.n_over else "", _shape_of_error(given[worst], truth.arrays[worst], d)]
@@ -234,6 +247,7 @@ def _row_of_arrays(
         n_candidates=int(may_flip[names[0]].sum()) if stage in FLIPPING else 0,
         note=", ".join(filter(None, notes)),
         arrays=wrong,
+        marks=marks,
     )
 
 
@@ -258,11 +272,15 @@ def as_report(renderer: ComparedRenderer, rows: list[Row], settings: Mapping[str
     scenes = list(dict.fromkeys(row.scene for row in rows))
     first = first_divergence(rows)
     given = [stage for stage in STAGES if any(r.stage == stage and r.status != "not given" for r in rows)]
+    unknown = "" if first is None else _or_before(renderer, first, given)
     verdict = (
         f"all {len(given)} stages that it gives agree"
         if first is None
-        else f"the first stage that diverges is {first.stage}, in scene {first.scene}"
+        else f"the first stage that diverges is {first.stage}, in scene {first.scene}{unknown}"
     )
+    found = signature(marks_by_scene(rows))
+    likely = likeliest(found, scenes, is_fed=renderer.is_staged)
+    missing = [array for array in (*INTERMEDIATE, *GRADIENTS) if array not in found]
     where = f"scene {scenes[0]}" if len(scenes) == 1 else f"{len(scenes)} scenes"
     cases = [_case([row for row in rows if row.stage == stage], first) for stage in given]
     details = [{"scene": row.scene, "stage": row.stage, "result": row.status, **_figures([row])} for row in rows]
@@ -274,10 +292,28 @@ def as_report(renderer: ComparedRenderer, rows: list[Row], settings: Mapping[str
             "renderer": renderer.name,
             "fed_with_truth": renderer.is_staged,
             "not_given": [stage for stage in STAGES if stage not in given],
+            "looks_like": in_words(found, likely, missing) if likely else [],
             "first_divergence": None if first is None else {"stage": first.stage, "scene": first.scene},
             "scenes": [{k: _finite(v) for k, v in detail.items()} for detail in details],
         },
     )
+
+
+def marks_by_scene(rows: Iterable[Row]) -> dict[str, dict[str, Mark]]:
+    """Return the marks of rows by scene, then array."""
+    marks: dict[str, dict[str, Mark]] = {}
+    for row in rows:
+        marks.setdefault(row.scene, {}).update(row.marks)
+    return marks
+
+
+def _or_before(renderer: ComparedRenderer, first: Row, given: Iterable[str]) -> str:
+    """Say which stages that the first one is computed from are not given, so that the error may be in one of them."""
+    if renderer.is_staged:
+        return ""
+    sources = {source for array in first.arrays or STAGES[first.stage] for source in _sources(array)}
+    unknown = [s for s, arrays in STAGES.items() if s not in given and s != first.stage and sources & set(arrays)]
+    return f"; or the error is in {', '.join(unknown)}, which it does not give" if unknown else ""
 
 
 def _case(rows: list[Row], first: Row | None) -> Case:

@@ -12,7 +12,8 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_compat import Views, check_batch, rasterization, rasterization_vjp, render_one
+from minisplat_ref.gsplat_arguments import Options, Views, check_batch
+from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp, render_one
 from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.splatting import Primitives, SplatTape
@@ -156,7 +157,7 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
     )
     views = Views(a["viewmats"], a["Ks"], subject.width, subject.height)
     sh_degree, backgrounds = options.get("sh_degree"), options.get("backgrounds")
-    batch = check_batch(primitives, views, a["colors"], sh_degree, backgrounds, "RGB")
+    batch = check_batch(primitives, views, a["colors"], backgrounds, Options(sh_degree))
     return [render_one(batch, c, conventions, backend) for c in range(len(batch.cameras))]
 
 

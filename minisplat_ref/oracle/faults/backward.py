@@ -1,0 +1,77 @@
+"""Backends with a wrong gradient and right images, by a size."""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.oracle.faults.forward import RIGHT, rebuilt, with_stages
+from minisplat_ref.oracle.planted import plant
+from minisplat_ref.reference import projection as reference_projection
+from minisplat_ref.types import CompositeGradient, PrimitiveGradient, ProjectionGradient
+
+
+def scale_gradient(stage: str, *fields: str, columns: tuple[float, ...] | None = None) -> Callable[[float], Backend]:
+    """Return what plants a factor in fields of the gradient of a stage; ``columns`` tells in which columns, by 1."""
+
+    def plant_factor(factor: float) -> Backend:
+        by: Any = factor if columns is None else np.where(np.array(columns) == 1, factor, 1.0)
+        right = getattr(RIGHT, stage)
+
+        @wraps(right)
+        def wrong(*args: Any) -> Any:
+            v = right(*args)
+            return v._replace(**{field: (getattr(v, field) * by).astype(getattr(v, field).dtype) for field in fields})
+
+        return with_stages(**{stage: wrong})
+
+    return plant_factor
+
+
+def changed_project_vjp(change: Callable[[PrimitiveGradient, tuple[Any, ...]], PrimitiveGradient]) -> Backend:
+    """Return a backend whose gradient of the projection is changed; the change also gets the arguments."""
+
+    @wraps(RIGHT.project_vjp)
+    def project_vjp(*args: Any) -> PrimitiveGradient:
+        return change(RIGHT.project_vjp(*args), args)
+
+    return with_stages(project_vjp=project_vjp)
+
+
+def with_v_alpha(factor: float) -> Backend:
+    """Return a backend that multiplies the derivative with respect to alpha's image."""
+
+    @wraps(RIGHT.composite_vjp)
+    def composite_vjp(*args: Any) -> CompositeGradient:
+        return RIGHT.composite_vjp(*args[:-1], factor * args[-1])
+
+    return with_stages(composite_vjp=composite_vjp)
+
+
+def with_v_depths(factor: float) -> Backend:
+    """Return a backend that multiplies the derivative with respect to the depths."""
+
+    @wraps(RIGHT.project_vjp)
+    def project_vjp(*args: Any) -> PrimitiveGradient:
+        v: ProjectionGradient = args[-1]
+        return RIGHT.project_vjp(*args[:-1], v._replace(depths=factor * v.depths))
+
+    return with_stages(project_vjp=project_vjp)
+
+
+def scale_share(name: str) -> Callable[[float], Backend]:
+    """Return what multiplies one function of the projection's gradient by the size."""
+    right = getattr(reference_projection, name)
+
+    def plant_factor(factor: float) -> Backend:
+        project_vjp = rebuilt(**{name: lambda *args: factor * right(*args)}).project_vjp
+        return with_stages(project_vjp=project_vjp)
+
+    return plant_factor
+
+
+def as_planted(name: str) -> Callable[[float], Backend]:
+    """Return what plants one of :data:`minisplat_ref.oracle.planted.PLANTED` in the reference."""
+    return lambda _: plant(name, REFERENCE)
