@@ -1,11 +1,13 @@
 """Footprints on tangent planes by hand, for a camera that is turned and has two focal lengths."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.mechanisms.tangent.planes import FootprintGradient, TangentFootprints, hit, project, project_vjp
 from minisplat_ref.rendering import activate
+from minisplat_ref.types import Gaussians
 from scenes import balls, in_front_of, make_camera, turned_camera
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
@@ -45,6 +47,30 @@ def test_a_direction_behind_the_image_has_no_pixel():
     v_primitives, v_means2d = project_vjp(primitives, camera, GSPLAT_MAIN, footprints, v)
     assert_array_equal(v_means2d, 0)
     assert np.abs(v_primitives.means).min() > 0.01
+
+
+@pytest.mark.parametrize(("thickness", "counts_as"), [(1e-5, 1e-3), (1e-3, 1e-3), (2e-3, 2e-3)])
+def test_depths_of_flat_gaussians_are_those_of_a_thousandth_of_their_length(thickness, counts_as):
+    """A disc of radius 0.5 at (0.4, 0, 4), normal to n = (0.6, 0, 0.8), and the ray along the axis.
+
+    It is densest at ``t = (d^T W x) / (d^T W d)`` with ``W = I / 0.25 + (1 / (0.5 k)^2 - 1 / 0.25) n n^T``.
+    """
+    camera, n, x = turned_camera(), N, np.array([0.4, 0.0, 4.0])
+    half = camera.cam_from_world_R.T @ n + [0, 0, 1]  # a half turn about it takes z to n, in the world
+    disc = Gaussians(
+        in_front_of(camera, x),
+        np.array([[0.0, *half]]),
+        np.log([[0.5, 0.5, 0.5 * thickness]]),
+        np.array([2.0]),
+        np.zeros((1, 3)),
+        np.zeros((1, 0, 3)),
+    )
+    footprints = project(activate(disc), camera, GSPLAT_MAIN)
+    d = np.array([0.0, 0.0, 1.0])
+    W = np.eye(3) / 0.25 + (1 / (0.5 * counts_as) ** 2 - 1 / 0.25) * np.outer(n, n)
+    found = hit(footprints, np.zeros(1, int), np.array([[camera.cx, camera.cy]])).depths
+    assert_allclose(found, [[(d @ W @ x) / (d @ W @ d)]], rtol=1e-9)
+    assert abs(found[0, 0] - (n @ x) / (n @ d)) > 1e-7  # not quite where the plane is
 
 
 def test_a_ray_meets_the_plane_up_to_a_millionth_of_a_right_angle():
