@@ -70,7 +70,14 @@ GS = {
         reset_opacity_on_white__ceiling=0.01,
         min_views=1,
     ),
-    **rows(f"{OURS}: published lengths change nothing", short_run_exponent=0.0),
+    **rows(
+        f"{OURS}: they concern runs shorter than published",
+        short_run_exponent=0.0,
+        clone_and_split__min_gap=100,
+        prune_faint__min_gap=100,
+        prune_large__min_gap=100,
+        reset_opacity__min_gap=300,
+    ),
 }
 
 GS_ACCEL = GS | {
@@ -111,6 +118,7 @@ MINI_SPLATTING_D = {
         reinitialise_from_depth__min_alpha=0.0,
         reinitialise_from_depth__depth_tolerance=0.05,
         reinitialise_from_depth__backdrop_extents=30.0,
+        prune_large_by_distance__min_gap=100,
         min_views=3,
         short_run_exponent=0.45,
     ),
@@ -206,6 +214,9 @@ MICRO = {
         halve_large__trace=1e-3,
         halve_large__trace_limit=0.05,
         clone_and_split_by_detail__beta=0.5,
+        clone_and_split_by_detail__min_gap=100,
+        halve_large__min_gap=100,
+        merge_alike__min_gap=100,
         merge_alike=[steps(15_000, 24_000, 1_000)],
         merge_alike__merge_reach=1.0,
         merge_alike__merge_color=0.1,
@@ -231,6 +242,7 @@ FANS = {
         keep_in_range=[steps(1, 30_000)],
         prune_faint_fans=[steps(1_000, 30_000, 1_000)],
         prune_faint_fans__min_opacity=0.02,
+        prune_faint_fans__min_gap=100,
     ),
 }
 
@@ -248,7 +260,8 @@ TABLES = {
         measure_filters=[[1], steps(100, 30_000, 100)],
         measure_filters__variance=0.2,
         rate__filter_sigmas=0.0,
-    ),
+    )
+    | rows(f"{OURS}: half that of densification", measure_filters__min_gap=50),
     "cuts": GS_ACCEL
     | rows(
         f"{OURS}: the paper's edges are hard, with another gradient",
@@ -271,9 +284,11 @@ TABLES = {
         rate__n_vertices=0.0,
         simplify_hulls=[steps(1_500, 14_500, 500)],
         simplify_hulls__min_height=0.5,
+        simplify_hulls__min_gap=100,
         promote=[steps(1_500, 14_500, 500)],
         promote__ratio=6.0,
         promote__size_fraction=0.01,
+        promote__min_gap=100,
     ),
     "multi-scale": GS
     | rows(
@@ -357,7 +372,8 @@ def facts_of(recipe):
     for event in recipe.events:
         name = action_name(event)
         facts.setdefault(name, []).append(dates_of(event._replace(action=None), recipe.iterations))
-        for key, value in settings_of(name, event.action).items():
+        gap = {f"{name}.min_gap": event.min_gap} if getattr(event, "min_gap", 1) > 1 else {}
+        for key, value in (settings_of(name, event.action) | gap).items():
             together.setdefault(key, []).append(value)
     facts |= {key: found[0] if len(set(found)) == 1 else found for key, found in together.items()}
     facts |= settings_of("extend", recipe.representation.extend)
