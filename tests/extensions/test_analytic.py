@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import dblquad
 
 from gradcheck import check_jacobian
@@ -31,7 +31,7 @@ from minisplat_ref.extensions.analytic.stages import stages
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Model, Projection, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import (
     ALPHA_INTEGRAL,
     COVERAGE_MIN,
@@ -194,6 +194,24 @@ def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, size, rng):
         found, scale = getattr(v_ours, name), np.abs(expected).max()
         assert found.dtype == dtype and scale > 0
         assert np.abs(found - expected).max() <= gradient_rel * scale, name
+
+
+def test_a_pixel_holds_the_integral_of_what_is_thinner_than_it(backend):
+    """A ball at the corner of four pixels, and of four tiles, whose deviations are 0.2 and 0.125 pixels.
+
+    Each of the four gets ``o 2 pi l_1 l_2 (F(1 / l_1) - F(0)) (F(1 / l_2) - F(0))`` with the paper's F, a quarter of
+    ``0.9 * 2 pi * 0.2 * 0.125``. With a low-pass it would reach further pixels; sampled at their
+    centres, it would reach none.
+    """
+    camera = turned_camera(60, 28, cx=32.0, cy=16.0)
+    ball = balls(in_front_of(camera, [0.0, 0.0, 5.0]), [0.025], [0.9])
+    alpha = DRAW.render(Model(ball), view_from(camera), Request(backend=backend))[0].alpha
+    (F5, F8) = (1 / (1 + np.exp(-(1.6 * x + 0.07 * x**3))) for x in (5.0, 8.0))
+    quarter = 0.9 * 2 * np.pi * 0.2 * 0.125 * (F5 - 0.5) * (F8 - 0.5)
+    assert quarter == pytest.approx(0.0353429, abs=1e-7)
+    assert_allclose(alpha[15:17, 31:33], quarter, rtol=1e-6)  # the constants of F are rounded to float32
+    alpha[15:17, 31:33] = 0
+    assert_array_equal(alpha, 0)
 
 
 def test_wide_gaussians_are_drawn_as_by_3dgs_without_a_low_pass(backend, rng):

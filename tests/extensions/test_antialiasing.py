@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from actions import act, scene_of, state_of
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
@@ -15,21 +16,25 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.antialiasing.method import (
+    ANTIALIASING,
     EPS2D,
     FILTERED,
     MIP,
     FilteredGaussians,
     add_filters,
+    measure_filters,
     with_3d_filter,
 )
 from minisplat_ref.extensions.antialiasing.reference import smooth, smooth_vjp
 from minisplat_ref.mechanisms import sampling
 from minisplat_ref.mechanisms.sampling import sampling_intervals, shrink_photographs
+from minisplat_ref.methods.gaussian_splatting import clone_and_split
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
+from minisplat_ref.training.schedule import does, firing_steps, scale_recipe
 from minisplat_ref.types import Gaussians, Model, View, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT64, ROUNDED_TO_FLOAT32
 
 
@@ -109,6 +114,42 @@ def test_the_image_keeps_its_mass_when_a_gaussian_is_filtered():
         sums.append(image.sum())
     # The 3D integral is kept, so what a ray collects sinks as the depth grows: by s / s' = 1 / sqrt(2).
     assert sums[1] / sums[0] == pytest.approx(np.sqrt(0.5), rel=1e-3)  # truncated at three and a half deviations
+
+
+# --- the filters of the recipe ---
+
+
+def test_the_recipe_measures_a_fifth_of_the_squared_interval():
+    """At depth 5 a pixel of the camera with f = 40 is 1/8 wide, at depth 2 in the nearer one 1/20."""
+    far, near = turned_camera(), turned_camera()
+    near = near._replace(cam_from_world_t=near.cam_from_world_t - [0.0, 0.0, 3.0])
+    # The second is behind the nearer camera.
+    gaussians = balls(in_front_of(far, [[0.1, 0.2, 5.0], [0.0, 0.1, 2.5]]), [0.1, 0.1], [0.5, 0.5])
+    state = state_of(with_filters(gaussians, [9.0, 9.0]))
+    act(ANTIALIASING._replace(events=ANTIALIASING.events[-1:]), measure_filters, state, scene_of([far, near]))
+    assert_allclose(state.gaussians.filter_sigmas, [0.05 * 0.4472135955, 0.0625 * 0.4472135955], rtol=1e-9)
+
+
+def test_filters_are_measured_at_once_every_hundred_iterations_and_after_each_densification():
+    assert firing_steps(ANTIALIASING, measure_filters) == [1, *range(100, 30_001, 100)]
+    short = scale_recipe(ANTIALIASING, 3_000)
+    assert firing_steps(short, measure_filters) == [1, *range(50, 3_001, 50)]
+    for recipe in (ANTIALIASING, short):
+        grows = firing_steps(recipe, clone_and_split)
+        last = {step: [event for event in recipe.events if event.is_due(step)][-1] for step in grows}
+        assert len(grows) > 10 and all(does(event, measure_filters) for event in last.values())
+
+
+def test_the_blur_is_a_tenth_of_a_squared_pixel_and_keeps_the_light():
+    """A ball with deviations of 0.4 and 0.25 pixels, seen 0.3 to the right of its centre and 0.4 above.
+
+    Variances of 0.16 and 0.0625 become 0.26 and 0.1625, so it is weaker by sqrt(0.16 * 0.0625 / (0.26 * 0.1625)), which
+    is 0.4865, and falls off by exp(-(0.09 / 0.26 + 0.16 / 0.1625) / 2), which is 0.5141.
+    """
+    camera = turned_camera(cx=17.2, cy=11.9)
+    ball = balls(in_front_of(camera, [0.0, 0.0, 5.0]), [0.05], [0.9])
+    alpha = MIP.render(Model(with_filters(ball, [0.0])), view_from(camera), Request(backend=REFERENCE))[0].alpha
+    assert alpha[11, 17] == pytest.approx(0.9 * 0.486504 * 0.514076, rel=2e-6)
 
 
 # --- where it is 3DGS ---

@@ -136,6 +136,38 @@ def matching_rows(gaussians, back, bound):
     return order
 
 
+def test_a_gaussian_of_the_finest_level_by_hand():
+    """Steps of 2^-8 for log scales and 2^-6 for the logit, 2^-8 and 2^-9 for the colour, 2^-10 for the quaternion.
+
+    The middle deviation is e^-1.3, in which 2^-2 is the largest power of two, so centres have steps of 2^-9.
+    """
+    one = Gaussians(
+        means=np.array([[0.7, -0.7, 0.0]]),
+        quats=np.array([[1.0, 0.3, -0.3, 0.0]]),
+        log_scales=np.array([[-1.3, -5.0, 0.01]]),
+        opacity_logits=np.array([0.4]),
+        sh_dc=np.array([[0.3, -0.3, 0.001]]),
+        sh_rest=np.full((1, 3, 3), 0.1),
+    )
+    back = msz.decode(msz.encode(Gaussians(*(field.astype(np.float32) for field in one)), 1), "file")
+    expected = Gaussians(
+        np.array([[358, -358, 0]]) / 512,
+        np.array([[1024, 307, -307, 0]]) / 1024,
+        np.array([[-333, -1280, 3]]) / 256,
+        np.array([26]) / 64,
+        np.array([[77, -77, 0]]) / 256,
+        np.full((1, 3, 3), 51) / 512,
+    )
+    for name, field in back._asdict().items():
+        assert_array_equal(field, getattr(expected, name).astype(np.float32), err_msg=name)
+
+
+def test_levels_drop_a_bit_of_geometry_and_of_colour_in_turn():
+    assert levels.exponents(2) == (-6, -9, -7, -6, -8, -9)
+    assert levels.exponents(3) == (-6, -9, -7, -5, -7, -8)
+    assert levels.exponents(12) == (-1, -4, -2, -1, -3, -4)
+
+
 @pytest.mark.parametrize("sh_degree", range(4))
 def test_msz_becomes_smaller_level_by_level(sh_degree):
     sizes = [len(msz.encode(population(2000, sh_degree), level)) for level in LEVELS]

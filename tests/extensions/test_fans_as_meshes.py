@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from actions import act, scene_of, state_of
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans, write_mesh
 from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, keep_in_range, prune_faint_fans, render, render_vjp
 from minisplat_ref.extensions.fans.profile import fan_profile, mass, profile_error
@@ -175,14 +177,15 @@ def test_kernels_are_the_reference(shape):
         assert_allclose(a, b, atol=PARITY_FLOAT32_GRADIENT * np.abs(b).max())
 
 
-def test_the_gradient_of_projected_centres_moves_a_whole_fan(rng):
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_gradient_of_projected_centres_moves_a_whole_fan(axis, rng):
     fans, camera = fans_of(rng, 3), make_camera(rng=rng)
     view, request, step = view_from(camera), Request(backend=REFERENCE), 1e-5
     output, tape = render(Model(fans), view, request)
     v_image = rng.normal(size=output.image.shape)
     v = render_vjp(tape, v_image).means2d
     z = fans.means @ camera.cam_from_world_R[2] + camera.cam_from_world_t[2]
-    per_pixel = camera.cam_from_world_R[0] * z[1] / camera.fx  # world units of fan 1 for a pixel to the right
+    per_pixel = camera.cam_from_world_R[axis] * z[1] / (camera.fx, camera.fy)[axis]  # world units of fan 1
 
     def loss(shift):
         means, rims = fans.means.copy(), fans.rims.copy()
@@ -190,8 +193,8 @@ def test_the_gradient_of_projected_centres_moves_a_whole_fan(rng):
         rims[1] += shift * per_pixel
         return np.vdot(render(Model(fans._replace(means=means, rims=rims)), view, request)[0].image, v_image)
 
-    assert abs(v[1, 0]) > 1e-2
-    assert (loss(step) - loss(-step)) / (2 * step) == pytest.approx(v[1, 0], rel=1e-4)
+    assert abs(v[1, axis]) > 1e-2
+    assert (loss(step) - loss(-step)) / (2 * step) == pytest.approx(v[1, axis], rel=1e-4)
 
 
 def test_rows_that_are_not_drawn(backend, rng):
@@ -226,6 +229,14 @@ def test_colors_stay_in_range_and_faint_fans_go(rng):
     prune_faint_fans(state, None, min_opacity=0.02)
     assert_array_equal(state.gaussians.means, fans.means[[0, 1, 3, 4, 5]])
     assert state.adam.first.rims.shape == (5, 1, 8, 3)
+
+
+def test_a_fan_goes_once_its_most_opaque_vertex_is_below_two_hundredths(rng):
+    fans = fans_of(rng, 4, dtype=np.float32)
+    fans.opacities[:] = [[0.9] + [0.0] * 8, [0.019] * 9, [0.0] * 8 + [0.021], [0.0] * 9]
+    state = state_of(fans)
+    act(find_recipe("fans"), prune_faint_fans, state, scene_of())
+    assert_array_equal(state.gaussians.means, fans.means[[0, 2]])
 
 
 def test_the_best_shape_is_found_again(rng):

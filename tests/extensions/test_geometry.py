@@ -9,7 +9,7 @@ from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref.extensions.geometry import EXTENSION, kernels, reference
 from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
 from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smoothness, normal_smoothness_vjp
-from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
+from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import Request, render, render_vjp
@@ -89,9 +89,9 @@ def test_edge_weights_by_hand():
     photograph = np.zeros((2, 2, 3))
     photograph[0, 1], photograph[1, 0] = [0.3, 0.0, 0.0], [0.1, 0.2, 0.3]
     down, right = edge_weights(photograph)
-    k = EDGE_SHARPNESS
-    assert_allclose(right, [[np.exp(-0.1 * k)], [np.exp(-0.2 * k)]], rtol=CLOSED_FORM)
-    assert_allclose(down, [[np.exp(-0.2 * k), np.exp(-0.1 * k)]], rtol=CLOSED_FORM)
+    once, twice = 0.36787944117144233, 0.1353352832366127  # e^-1 and e^-2, of means that differ by 0.1 and 0.2
+    assert_allclose(right, [[once], [twice]], rtol=CLOSED_FORM)
+    assert_allclose(down, [[twice, once]], rtol=CLOSED_FORM)
 
 
 @pytest.mark.parametrize("weights", [DEPTH, NORMALS])
@@ -123,7 +123,7 @@ def test_step_costs_less_at_an_edge_of_the_photograph(backend, contrast):
     camera, depth, photograph = make_camera(), np.full((18, 24), 2.0), np.zeros((18, 24, 3))
     depth[:, 10:] = 3.0
     photograph[:, 10:] = contrast
-    expected = 18 * np.exp(-EDGE_SHARPNESS * contrast) * np.log(1.5) / (18 * 23 + 17 * 24)
+    expected = 18 * np.exp(-10 * contrast) * np.log(1.5) / (18 * 23 + 17 * 24)
     assert loss_of(backend, depth, camera, DEPTH, photograph=photograph)[0] == pytest.approx(
         expected, rel=1e2 * CLOSED_FORM
     )
@@ -141,7 +141,7 @@ def test_crease_between_two_planes(backend, edge):
     weight = 1.0
     if edge is not None:
         photograph[:, edge:] += 0.1
-        weight = np.exp(-0.1 * EDGE_SHARPNESS) if edge in (10, 11) else 1.0
+        weight = np.exp(-1) if edge in (10, 11) else 1.0
     cosine = n_left @ n_right / (np.linalg.norm(n_left) * np.linalg.norm(n_right))
     expected = 17 * weight * (1 - cosine) / (17 * 22 + 16 * 23)
     loss, _ = loss_of(backend, depth, camera, NORMALS, photograph=photograph)
@@ -150,7 +150,7 @@ def test_crease_between_two_planes(backend, edge):
 
 @pytest.mark.parametrize("ratio", [1.0, 1.004, 0.996, 1.2, 0.7])
 def test_depth_error_at_a_point(backend, ratio, rng):
-    camera, tau = make_camera(rng=rng), SFM_DEPTH_TOLERANCE
+    camera, tau = make_camera(rng=rng), 0.01
     depth = np.full((18, 24), 2.0)
     points = lift(camera, [5.9, 5.1], [3.2, 3.7], 2.0 / ratio)  # both in pixel (5, 3)
     loss, tape = loss_of(backend, depth, camera, SFM, points=points, alpha=0.8)
@@ -175,7 +175,7 @@ def test_mean_is_over_points_that_are_seen(backend):
     empty, masked = lift(camera, [7.5], [7.5], 4.0), lift(camera, [8.5], [8.5], 4.0)
     points = np.concatenate([outside, seen, behind, empty, masked, np.zeros((1, 3)), np.full((1, 3), np.nan)])
     loss, tape = loss_of(backend, depth, camera, SFM, points=points, alpha=alpha, mask=mask)
-    assert loss == pytest.approx(np.log(2) - SFM_DEPTH_TOLERANCE / 2, rel=CLOSED_FORM)
+    assert loss == pytest.approx(np.log(2) - 0.005, rel=CLOSED_FORM)
     v_depth, _ = functions_of(backend).geometric_loss_vjp(tape)
     assert_array_equal(np.argwhere(v_depth), [[0, 0], [4, 4]])
 

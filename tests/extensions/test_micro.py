@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from actions import act, scene_of, state_of
 from gradcheck import check_jacobian
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
@@ -14,7 +15,13 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.micro.method import clone_and_split_by_detail, clusters, halve_children
+from minisplat_ref.extensions.micro.method import (
+    clone_and_split_by_detail,
+    clusters,
+    halve_children,
+    halve_large,
+    merge_alike,
+)
 from minisplat_ref.extensions.micro.reference import (
     are_alike,
     box_means,
@@ -30,6 +37,7 @@ from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
+from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.schedule import At, During, Every, configure, does
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
@@ -73,6 +81,25 @@ def test_the_gradient_of_the_penalty(rng):
         [log_scales],
         names=["log_scales"],
     )
+
+
+def test_the_recipe_penalises_deviations_beyond_a_share_of_the_extent():
+    """In a scene of extent 3, tau is (0.05 * 3)^2 = 0.0225; a ball of deviation 0.1 has the trace 0.03, a third more.
+
+    The mean over two balls is a sixth; the slope for each axis of the large one is 2 * 0.01 / 0.0225 / 2 = 4 / 9.
+    """
+    gaussians = balls(np.zeros((2, 3)), [0.1, 0.05])
+    (term,) = (term for term in find_recipe("micro").losses if term.name == "trace")
+    value, cotangents = term.function(Rendered(None, {}, None, scene_of(extent=3.0), Model(gaussians), 1, None))
+    assert value == pytest.approx(1 / 6, rel=CLOSED_FORM)
+    assert_allclose(cotangents.gaussians["log_scales"], [[4 / 9] * 3, [0] * 3], rtol=CLOSED_FORM)
+
+
+def test_the_recipe_halves_what_it_penalises():
+    """The trace 0.0225 is that of a ball of deviation 0.0866; the halves are 0.088 / sqrt(2) wide."""
+    state = state_of(balls(np.zeros((2, 3)), [0.0880, 0.0850]))
+    act(find_recipe("micro"), halve_large, state, scene_of(extent=3.0))
+    assert_allclose(np.exp(state.gaussians.log_scales[:, 0]), [0.085, 0.0622254, 0.0622254], rtol=1e-6)
 
 
 def test_it_keeps_float32_and_takes_no_gaussians(rng):
@@ -160,6 +187,28 @@ def test_twins_are_merged_and_others_are_not():
     alike = gaussians._replace(sh_dc=gaussians.sh_dc * [[1], [1], [0], [0]])
     assert_array_equal(clusters(gaussians, reach=0.5, color_reach=2.0), [0, 1, 0, 1])
     assert_array_equal(clusters(alike, reach=0.5, color_reach=0.5), [0, 1, 2, 3])
+
+
+def test_merged_twins_weigh_as_much_as_the_light_that_they_stop():
+    """Opacities of 1/2 and 7/8 are optical depths of ln 2 and 3 ln 2, so the place is three quarters of the way."""
+    gaussians = balls([[1, 0, 0], [1, 0.04, 0]], [0.1, 0.1], [[0.02, 0, 0.08], [0.06, 0, 0.04]])
+    state = state_of(gaussians._replace(opacity_logits=np.log([1.0, 7.0])))
+    act(find_recipe("micro"), merge_alike, state, scene_of())
+    assert_allclose(state.gaussians.means, [[1, 0.03, 0]], rtol=CLOSED_FORM)
+    assert_allclose(SH_C0 * state.gaussians.sh_dc, [[0.05, 0, 0.05]], rtol=CLOSED_FORM, atol=CLOSED_FORM)
+    # Of Sigma, along y, 0.01 + 0.25 * 0.03^2 + 0.75 * 0.01^2.
+    assert_allclose(covariances(state.gaussians.quats, np.exp(state.gaussians.log_scales))[0, 1, 1], 0.0103, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("distance", "color", "is_merged"),
+    [(0.17, 0.09, True), (0.18, 0.09, False), (0.17, 0.11, False)],  # sqrt(3) * 0.1 is 0.173
+)
+def test_the_recipe_merges_within_a_size_and_a_tenth_of_a_colour(distance, color, is_merged):
+    state = state_of(balls([[0, 0, 0], [0, distance, 0]], [0.1, 0.1], [[0, 0, 0], [0, 0, color]]))
+    note = act(find_recipe("micro"), merge_alike, state, scene_of())
+    assert len(state.gaussians.means) == 2 - is_merged
+    assert note == (None if is_merged else "nothing done: no two neighbours are alike")
 
 
 # --- where it is 3DGS ---

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from actions import act, scene_of, state_of
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -17,11 +18,11 @@ from minisplat_ref.cpu.compositing.hits import composite_hits as composite_by_ke
 from minisplat_ref.cpu.compositing.plain_conic import composite as composite_conics
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.extension import load_extension
+from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.mixed import fit
 from minisplat_ref.extensions.mixed.kernels import response_for
 from minisplat_ref.extensions.mixed.kinds import coverage, promote_kinds, simplify_kinds, whiten_vertices
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
+from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simplify_hulls
 from minisplat_ref.extensions.mixed.population import (
     MixedGaussians,
     as_ellipses,
@@ -38,7 +39,7 @@ from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.studies.kit import psnr_of
 from minisplat_ref.types import Primitives, Projection, TileGrid, view_from
 from payloads import drawn
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, HULL_COVERAGE, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, TANGENT_LEVEL
 
 Q = np.array([[[0.31, 0.12], [0.12, 0.2]]])  # px^-2
@@ -262,6 +263,27 @@ def test_near_points_of_like_colour_become_one():
     assert groups(points, to_lab(colors)).tolist() == [[0, 1, 2], [3, 5, -1], [4, -1, -1], [6, -1, -1]]
 
 
+def test_of_three_points_each_two_must_be_alike():
+    """Greys of L = 50, 54 and 58: neighbours differ by 4, which is less than 5, the ends by 8."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [2.1, 0, 0]])
+    lab = np.array([[50.0, 0, 0], [54, 0, 0], [58, 0, 0]])
+    assert groups(points, lab).tolist() == [[0, 1, -1], [2, -1, -1]]
+    assert groups(points, lab * [0.6, 1, 1]).tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize(("distance", "is_one"), [(4.9, True), (5.1, False)])
+def test_colours_are_alike_below_five_in_lab(distance, is_one):
+    lab = np.array([[50.0, 3, 0], [50, 3, distance]])
+    assert groups(np.array([[0.0, 0, 0], [1, 0, 0]]), lab).tolist() == (
+        [[0, 1, -1]] if is_one else [[0, -1, -1], [1, -1, -1]]
+    )
+
+
+def test_a_fourth_point_is_no_part_of_a_triangle():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1.02, 0], [2.05, 0, 0]])  # the fourth is next to the second
+    assert groups(points, np.full((4, 3), 50.0)).tolist() == [[0, 1, 2], [3, -1, -1]]
+
+
 def test_lab_of_known_colours():
     found = to_lab(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1]]))
     expected = [[100, 0, 0], [0, 0, 0], [53.24, 80.09, 67.2], [32.3, 79.19, -107.86]]
@@ -310,6 +332,35 @@ def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
     assert_allclose(np.abs(np.sum(R[0, :, 0] * R_before[0, :, 1])), 1)  # along the needle
     assert_allclose(np.abs(np.sum(R[1, :, 2] * R_before[1, :, 1])), 1)  # in the disc's plane
     assert_allclose(after.means, population.means)
+
+
+def test_the_recipe_promotes_what_is_six_times_as_long_as_wide_and_a_hundredth_of_the_extent():
+    """In a scene of extent 2 from 0.02 on. What changes its shape loses the moments of its shape, and no others."""
+    widths = [[0.06, 0.0101, 0.0101], [0.0606, 0.01, 0.01], [0.019, 0.003, 0.003], [0.021, 0.003, 0.003]]
+    gaussians = as_ellipses(balls(np.zeros((4, 3)), np.ones(4), np.full(4, 0.5)))
+    state = state_of(gaussians._replace(log_scales=np.log(widths)))
+    for moment in (state.adam.first, state.adam.second):
+        for field in moment:
+            field[...] = 7.0
+    assert act(find_recipe("mixed"), promote, state, scene_of(extent=2.0)).startswith("2 changed")
+    assert counts(state.gaussians).tolist() == [1, 2, 1, 2]
+    for moment in (state.adam.first, state.adam.second):
+        for name, field in moment._asdict().items():
+            is_of_shape = name in ("means", "quats", "log_scales", "vertices")
+            assert (field[[0, 2]] == 7).all() and (field[[1, 3]] == (0 if is_of_shape else 7)).all(), name
+
+
+def test_the_recipe_simplifies_within_half_a_deviation():
+    """Lines of 0.49 and of 0.51 deviations, and triangles of a base of 6 and these altitudes: (-3, 0), (3, 0), (0, h).
+
+    The mean of a triangle's vertices is at a third of its altitude.
+    """
+    gaussians = as_ellipses(balls(np.zeros((4, 3)), np.full(4, 0.1), np.full(4, 0.5)))
+    lines, triangles = ([[h / 2, 0, 0, 0] for h in (0.49, 0.51)], [[3, -h / 3, 0, 2 * h / 3] for h in (0.49, 0.51)])
+    vertices, n_vertices = 0.1 * np.array([*lines, *triangles]), np.array([2, 2, 3, 3.0])
+    state = state_of(gaussians._replace(vertices=vertices, n_vertices=n_vertices))
+    act(find_recipe("mixed"), simplify_hulls, state, scene_of())
+    assert counts(state.gaussians).tolist() == [1, 2, 2, 3]
 
 
 # --- from end to end ---

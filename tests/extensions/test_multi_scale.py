@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from actions import act, scene_of, state_of
 from gradcheck import check_inner_products
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
@@ -17,7 +18,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import LEVELS, coarse, finest_densities
+from minisplat_ref.extensions.multi_scale.method import LEVELS, coarse, finest_densities, insert_levels
 from minisplat_ref.extensions.multi_scale.reference import NO_CELL, are_shown, coverages, pixel_densities
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
@@ -26,8 +27,8 @@ from minisplat_ref.strategy.simplify import optical_masses
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_STEP_IMAGE, MERGED_MOMENTS
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
+from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_STEP_IMAGE, MERGED_MOMENTS, PARITY_FLOAT64
 
 DRAW = LEVELS.renderer
 EVERYTHING = 1e9  # pixels of coverage, so that all Gaussians that share a cell are merged
@@ -138,6 +139,32 @@ def test_large_gaussians_are_not_merged():
     log_scales = np.where(large[:, None], np.log(1.0), gaussians.log_scales)
     levels = in_levels(gaussians._replace(log_scales=log_scales), Plan(4, 1, 4.0))
     assert (levels.cells[:64, 1][large] == NO_CELL).all() and (levels.cells[:64, 1][~large] < NO_CELL).any()
+
+
+def test_the_recipe_merges_what_is_thinner_than_four_pixels_in_levels_of_four():
+    """At about 8 pixels per unit, cells of level 1 are 1/2 wide, of level 2 2, of level 3 8, and a pixel each.
+
+    A ball of opacity 0.98 is seen until 3.323 deviations from its centre. So 4 pixels are 0.602 deviations to the left
+    and right: 0.301 units at level 1, 1.204 at level 2. Of three pairs, the first is just below the former, the second
+    just above, and the third just above the latter. Each pair is in a cell of every level, and the last cell holds all.
+    """
+    camera = turned_camera(fx=40.0, fy=25.0)
+    camera = camera._replace(cam_from_world_t=[0.0, 0.0, 5.0] - camera.cam_from_world_R @ [1.25, 0.25, 0.25])
+    pair = np.array([[0.2, 0.2, 0.2], [0.3, 0.3, 0.3]])
+    centers = (pair + np.array([[[0, 0, 0]], [[1, 0, 0]], [[2, 0, 0]]])).reshape(6, 3)
+    gaussians = balls(centers, np.repeat([0.299, 0.303, 1.21], 2), np.full(6, 0.98))
+    state = state_of(level_zero(gaussians, None))
+    act(find_recipe("multi-scale"), insert_levels, state, scene_of([camera]))
+    own = [0, 0, 0, 0, 0, 0, 0.5, 2, 8]
+    parents = [0.5, 0.5, 2, 2, 8, 8, 2, 8, NO_CELL]
+    assert_array_equal(state.gaussians.cells, np.column_stack([own, parents]))
+
+
+def test_densities_are_those_of_the_mean_focal_length_at_the_depth():
+    """sqrt(40 * 22.5) = 30 at a depth of 5, in a camera that is turned."""
+    camera = turned_camera(fx=40.0, fy=22.5)
+    means = in_front_of(camera, [[0.3, -0.2, 5.0], [-4.0, 1.0, 0.25]])
+    assert_allclose(pixel_densities(means, camera, 0.5), [6, 60], rtol=PARITY_FLOAT64)
 
 
 def test_nothing_to_merge_and_nothing_seen():

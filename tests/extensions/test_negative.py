@@ -32,7 +32,7 @@ from minisplat_ref.strategy.clone_split import prune_faint, prune_large
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import Iteration, TrainState, start_again
 from minisplat_ref.types import Gaussians, Model, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import (
     CLOSED_FORM,
     COVERAGE_MIN,
@@ -191,6 +191,25 @@ def test_color_has_its_gradient_on_either_side_of_zero_and_at_it(backend, color)
     assert_allclose(compute_signed_colors_vjp(backend, *arguments, v_colors).sh_dc, SH_C0 * v_colors, rtol=CLOSED_FORM)
 
 
+def test_each_gaussian_has_its_own_degree_on_either_side_of_zero(backend):
+    """Seen along (0.6, 0, 0.8), where degree 1 is ``C (0, 0.8, -0.6)``, in a camera that is turned.
+
+    A last coefficient of 2 takes 1.2 C = 0.5863230 from a colour of degree 1, and nothing from one of degree 0.
+    """
+    C, camera, n = 0.4886025119029199, turned_camera(), 4
+    base, degrees = np.array([0.9, -0.3, 0.1, -0.3]), np.array([1, 0, 1, 1])
+    gaussians = balls(in_front_of(camera, [0, 0, 0]) + 3 * np.array([[0.6, 0, 0.8]] * n), np.ones(n), [0.5] * n)
+    rest = np.zeros((n, 3, 3))
+    rest[:, 2] = 2
+    dc = np.repeat((base[:, None] - 0.5) / SH_C0, 3, axis=1)
+    arguments = (backend, gaussians.means, dc, rest, camera, degrees, np.ones((n, 2), np.int32))
+    expected = [0.9 - 1.2 * C, -0.3, 0.1 - 1.2 * C, -0.3 - 1.2 * C]
+    assert_allclose(compute_signed_colors(*arguments), np.repeat(np.array(expected)[:, None], 3, axis=1), atol=1e-12)
+    v = compute_signed_colors_vjp(*arguments, np.ones((n, 3)))
+    assert_allclose(v.sh_dc, SH_C0, rtol=CLOSED_FORM)
+    assert_allclose(v.sh_rest[:, :, 0], np.outer([1, 0, 1, 1], [0, 0.8 * C, -0.6 * C]), atol=1e-12)
+
+
 # --- parity ---
 
 
@@ -225,6 +244,18 @@ def test_a_fifth_begins_with_the_negative_of_its_color(rng):
     assert_array_equal(others[~is_negative], colors[~is_negative])
     assert colors.min() > 0  # the population that came in is as it was
     assert_array_equal(extended.means, gaussians.means)
+
+
+def test_the_negative_of_a_colour_is_negative_in_every_direction(rng):
+    """Of ten Gaussians two are negated, with degrees 0 and 1: seen along (0.6, 0, 0.8) and from the other side."""
+    C, gaussians = 0.4886025119029199, of_either_sign(rng, 10, sh_degree=1)
+    negated = with_negatives(gaussians, rng, fraction=0.2)
+    for sign in (1, -1):
+        Y = sign * C * np.array([0, 0.8, -0.6])
+        before, after = (0.5 + SH_C0 * g.sh_dc + np.einsum("k,nkc->nc", Y, g.sh_rest) for g in (gaussians, negated))
+        is_changed = (before != after).any(axis=1)
+        assert is_changed.sum() == 2
+        assert_allclose(after[is_changed], -before[is_changed], atol=CLOSED_FORM)
 
 
 def test_a_reinitialisation_begins_with_negatives_too(rng):

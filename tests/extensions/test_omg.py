@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import zstandard
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.cluster.vq import kmeans2
 
+from actions import act, scene_of, state_of
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from minisplat_ref import load_ply, load_scene, save_ply
 from minisplat_ref.cli import main
@@ -27,6 +29,7 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import action_name
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians
+from scenes import as_dtype, balls, make_camera
 from tolerances import CLOSED_FORM, HALF_FLOAT
 
 LEVELS = range(len(omg.LEVELS))
@@ -94,6 +97,20 @@ def test_with_distinctiveness_it_keeps_fewer_and_more_distinct_ones(scene):
     assert 0 < len(ours.gaussians.means) < len(theirs.gaussians.means)
 
 
+def test_the_recipe_keeps_99_percent_of_importance_times_distinctiveness_squared():
+    """Nine equal balls in a row, so LD^2 decides: 100, 100, 34.81, 3.24, 34.81, 36, 4, 36 and 100, 448.86 in all.
+
+    The fourth carries 0.7 %, the fourth and the seventh together 1.6 %: only the fourth goes.
+    """
+    steps = np.array([5, 5, 0.9, 0.9, 5, 1, 1, 5])
+    places = np.column_stack([1.6 * (np.arange(9) - 4), np.zeros(9), np.full(9, 100.0)])
+    gaussians = balls(places, np.full(9, 0.3), np.full(9, 0.9))
+    gray = np.concatenate([[0], np.cumsum(steps * (-1) ** np.arange(8))])
+    state = state_of(as_dtype(gaussians._replace(sh_dc=np.repeat(gray[:, None], 3, axis=1)), np.float32))
+    act(find_recipe("omg"), prune_indistinct, state, scene_of([make_camera(160, 16, fx=1000.0, fy=1000.0)]))
+    assert_allclose(state.gaussians.means[:, 0], np.delete(places[:, 0], 3), rtol=1e-6)
+
+
 def test_where_all_colours_are_alike_it_does_nothing(scene):
     state, iteration = state_and_iteration(scene)
     state.gaussians.sh_dc[:] = 0.25
@@ -130,6 +147,15 @@ def test_codes_are_means_of_their_own_and_vectors_take_the_nearest(rng):
     assert_allclose(codes[np.argsort(codes[:, 0])], np.array(expected)[[2, 0, 1]], rtol=CLOSED_FORM, atol=CLOSED_FORM)
     quantised = quantise(rng.normal(size=(400, 2)), 2, 16)
     assert len(quantised.codes[0]) == 16
+
+
+def test_codes_are_those_of_twelve_rounds_of_lloyds_algorithm():
+    """SciPy's, from the first number of each of the eight cells in which they lie, and the last of all."""
+    vectors = np.linspace(0.0, 1.0, 401)[:, None] ** 3
+    start = np.array([vectors[vectors[:, 0] >= k / 8][0] for k in range(9)])
+    eleven, twelve = (kmeans2(vectors, start, iter=n, minit="matrix")[0] for n in (11, 12))
+    assert np.abs(twelve - eleven).max() > 1e-4  # it has not ended
+    assert_allclose(fit_codes(vectors, 9), twelve, rtol=1e-9)
 
 
 def test_rare_vectors_are_not_starved(rng):

@@ -31,8 +31,16 @@ from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.rendering import SPLATTING, Request, activate
 from minisplat_ref.training.schedule import configure, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    GRADIENT_REL,
+    GRADIENT_STEP,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+)
 
 DRAW = ORDERED.renderer
 # A fixed ray seen by cameras that differ by a rotation: dozens of roundings of 1e-16, in exponents of up to 5.5.
@@ -174,23 +182,26 @@ def test_a_wrong_gradient_is_found(monkeypatch, small_proof):
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 
 
-def test_means2d_move_a_footprint_in_the_image(rng):
-    """A shift of the principal point moves everything by a pixel; a small footprint on the axis keeps its shape."""
-    model = Model(make_gaussians(rng, 1, sh_degree=0, size=0.02)._replace(means=np.array([[0.0, 0.0, 3.0]])))
-    camera, v_image = make_camera(fx=60.0, fy=60.0), rng.normal(size=(18, 24, 3))
-    _, tape = DRAW.render(model, view_from(camera), Request(backend=REFERENCE))
-    v = DRAW.render_vjp(tape, v_image, None).means2d[0]
+def test_means2d_move_a_footprint_in_the_image(backend, rng):
+    """A ball that keeps its distance while its direction moves by a pixel keeps its shape on the sphere.
 
-    def loss(cx, cy):
-        moved = camera._replace(cx=cx, cy=cy)
-        return np.sum(v_image * DRAW.render(model, view_from(moved), Request(backend=REFERENCE))[0].image)
+    It is 40 degrees off the axis of a turned camera, where a direction moves by ``n_z / f`` times a part of a pixel.
+    """
+    camera, v_image = turned_camera(48, 36, fx=40.0, fy=25.0, cx=12.0, cy=14.0), rng.normal(size=(36, 48, 3))
+    place, r = np.array([41.0, 22.0]), 3.0
 
-    h = 1e-5
-    numeric = [
-        (loss(camera.cx + h, camera.cy) - loss(camera.cx - h, camera.cy)) / (2 * h),
-        (loss(camera.cx, camera.cy + h) - loss(camera.cx, camera.cy - h)) / (2 * h),
-    ]
-    assert_allclose(v, numeric, rtol=5e-3)  # a shift differs from a rotation by the square of the footprint's angle
+    def model_at(x, y):
+        d = np.array([(x - 12) / 40, (y - 14) / 25, 1.0])
+        return Model(balls(in_front_of(camera, r * d / np.linalg.norm(d)), [0.15], [0.8], [[0.9, 0.6, 0.3]]))
+
+    def loss(x, y):
+        output, tape = DRAW.render(model_at(x, y), view_from(camera), Request(backend=backend))
+        return np.sum(v_image * output.image), tape
+
+    v = DRAW.render_vjp(loss(*place)[1], v_image, None).means2d[0]
+    for k, step in enumerate(GRADIENT_STEP * np.eye(2)):
+        slope = (loss(*(place + step))[0] - loss(*(place - step))[0]) / (2 * GRADIENT_STEP)
+        assert abs(slope) > 0.01 and v[k] == pytest.approx(slope, rel=GRADIENT_REL)
 
 
 def test_the_gradient_of_alpha(rng):

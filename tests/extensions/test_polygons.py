@@ -27,7 +27,7 @@ from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import (
     CLOSED_FORM,
     COVERAGE_MIN,
@@ -303,15 +303,25 @@ def test_hidden_rows_are_not_drawn_and_too_much_is_refused(backend, rng):
         DRAW.render(Model(g), view, Request(backend=backend, wants=frozenset({"surface"})))
 
 
-def test_training_starts_flat_and_facing_everywhere(rng):
+def test_training_starts_flat_and_facing_everywhere():
+    """Balls as training begins with, all of the same axes: the mean of n n^T over uniform directions is a third.
+
+    The variance of n_x^2 is 4/45, so of 3000 normals the mean is off by 0.0054, and four times that is allowed.
+    """
+    n = 3000
+    flat = press_flat(balls(np.zeros((n, 3)), np.full(n, 0.3), np.full(n, 0.5)), np.random.default_rng(0))
+    assert_allclose(np.exp(np.sort(flat.log_scales, axis=1)), [[1e-5, 0.3, 0.3]] * n, rtol=1e-9)
+    spans = polygons_of(flat, np.ones(n)).spans
+    normals = np.cross(spans[:, :, 0], spans[:, :, 1]) / 0.09
+    assert_allclose(normals.T @ normals / n, np.eye(3) / 3, atol=0.022)
+
+
+def test_what_has_a_shape_keeps_its_direction(rng):
     g = make_gaussians(rng, 50)
-    g.log_scales[:30] = g.log_scales[:30, :1]
     flat = press_flat(g, np.random.default_rng(0))
+    assert_array_equal(flat.quats, g.quats)
     assert_allclose(flat.log_scales.min(axis=1), LOG_THICKNESS)
-    assert_array_equal(flat.quats[30:], g.quats[30:])
-    normals = polygons_of(flat, np.ones(50)).spans[:30]
-    normals = np.cross(normals[:, :, 0], normals[:, :, 1])
-    assert np.linalg.matrix_rank(normals / np.linalg.norm(normals, axis=1, keepdims=True), tol=1.0) == 3
+    assert_array_equal(np.sort(flat.log_scales, axis=1)[:, 1:], np.sort(g.log_scales, axis=1)[:, 1:])
     again = press_flat(flat, np.random.default_rng(1))
     assert all(a.tobytes() == b.tobytes() for a, b in zip(flat, again, strict=True))
 

@@ -24,7 +24,7 @@ from minisplat_ref.reference.covariance import covariances, rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Gaussians
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import AFFINE_EDIT, CLOSED_FORM, COVERAGE_MIN, EDITED_IMAGE, PARITY_FLOAT32_PROJECTION
 
 LINEAR = {  # A of x -> A x + b
@@ -395,6 +395,18 @@ def test_edit_from_the_command_line(model, tmp_path, capsys):
     assert run("edit", model, out, "--sphere", 0, 0, 3, 0.7, "--matrix", 1, 0.5, 0, 0, 1, 0, 0, 0, 1) == 0
     assert run("edit", model, out, "--scale", 1, 2, 3) == 0
     assert_allclose(load_ply(out).means.mean(axis=0), before.means.mean(axis=0), atol=PARITY_FLOAT32_PROJECTION)
+
+
+def test_an_edit_by_hand(tmp_path):
+    """The middle of what is selected, (1, 2, 0), stays; and scaling comes before turning: x doubled becomes y."""
+    before = as_dtype(balls([[0, 2, 0], [2, 2, 0], [9, 9, 9]], [0.1, 0.2, 0.3], [0.5, 0.5, 0.5]), np.float32)
+    model, out = tmp_path / "model.ply", tmp_path / "out.ply"
+    save_ply(model, before)
+    assert run("edit", model, out, "--box", -1, -1, -1, 3, 3, 3, "--scale", 2, 1, 1, "--rotate", 0, 0, 90) == 0
+    after = load_ply(out)
+    assert_allclose(after.means, [[1, 0, 0], [1, 4, 0], [9, 9, 9]], atol=PARITY_FLOAT32_PROJECTION)
+    variances = np.array([[0.01, 0.04, 0.01], [0.04, 0.16, 0.04], [0.09, 0.09, 0.09]])
+    assert_allclose(sigma(after), variances[:, :, None] * np.eye(3), atol=PARITY_FLOAT32_PROJECTION)
 
 
 def test_edit_near_a_mesh(model, tmp_path, capsys):

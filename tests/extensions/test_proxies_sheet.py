@@ -200,6 +200,19 @@ def test_the_hanging_sheet_nears_the_catenary():
 # Energy and steps
 
 
+def test_the_floor_slows_down_only_what_is_below_it():
+    """For one unit of time: e^(-1/2) above the floor and upon it, e^(-5/2) below, where 2 is added to the drag."""
+    vertices = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # gravity is along y
+    springs = springs_between(np.array([[0, 1]]), vertices, np.zeros(1))
+    masses, floor = np.array([1.0, 2.0, 4.0]), Floor(0.0, 0.0, 2.0)
+    sheet = Sheet(masses, springs, np.array([False, True, False]), np.array([0.0, 1e-12, 0.0]), 0.5, floor)
+    v = np.array([[3.0, 0, 0], [0, 0, 3.0], [3.0, 0, 0]])
+    state = integrate(State(vertices, v), sheet, 0.1, 10)
+    decays = np.exp([-0.5, -0.5, -2.5])
+    assert_allclose(state.velocities, decays[:, None] * v, atol=1e-11)
+    assert_allclose(state.dissipated, 4.5 * np.sum(masses * (1 - decays**2)), rtol=1e-11)
+
+
 @pytest.mark.parametrize("name", ["no drag", "drag"])
 def test_the_energy_balance_closes_with_the_square_of_the_step(name):
     errors = [

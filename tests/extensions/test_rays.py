@@ -30,10 +30,12 @@ from minisplat_ref.mechanisms.rays.traversal import limits_of
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import (
     CLOSED_FORM,
     COVERAGE_MIN,
+    GRADIENT_REL,
+    GRADIENT_STEP,
     PARITY_FLOAT32_GRADIENT,
     PARITY_FLOAT32_IMAGE,
     PARITY_FLOAT64,
@@ -220,6 +222,25 @@ def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, rng):
         found, scale = v_ours[name], np.abs(expected).max()
         assert found.dtype == dtype and scale > 0
         assert np.abs(found - expected).max() <= gradient_rel * scale, name
+
+
+def test_means2d_move_a_gaussian_by_a_pixel_in_parallel_to_the_image(backend, rng):
+    """By ``z / f_k`` along the camera's axis k, in a camera that is turned and has two focal lengths."""
+    camera, v_image = turned_camera(), rng.normal(size=(28, 40, 3))
+    gaussians = balls(in_front_of(camera, [[0.3, 0.2, 3.0], [-0.5, 0.1, 4.0]]), [0.15, 0.2], [0.8, 0.6])
+    axes = camera.cam_from_world_R / np.array([[40.0], [25.0], [1.0]])  # world units at depth 1 for a pixel
+
+    def loss(moved):
+        output, tape = DRAW.render(Model(gaussians._replace(means=moved)), view_from(camera), Request(backend=backend))
+        return np.sum(v_image * output.image), tape
+
+    v = DRAW.render_vjp(loss(gaussians.means)[1], v_image, None).means2d
+    for row, z in enumerate((3.0, 4.0)):
+        for k in range(2):
+            step = np.zeros((2, 3))
+            step[row] = GRADIENT_STEP * z * axes[k]
+            slope = (loss(gaussians.means + step)[0] - loss(gaussians.means - step)[0]) / (2 * GRADIENT_STEP)
+            assert abs(slope) > 0.01 and v[row, k] == pytest.approx(slope, rel=GRADIENT_REL)
 
 
 def test_the_gradient_of_the_whole_model(backend, small_proof):

@@ -10,7 +10,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import claims, demo, surroundings
-from minisplat_ref.extensions.rays.lights import shade, visibility
+from minisplat_ref.extensions.rays.lights import irradiance, shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whiten_model
 from minisplat_ref.extensions.rays.reference import intersect
 from minisplat_ref.extensions.rays.surfaces import (
@@ -103,6 +103,9 @@ def test_snell_schlick_and_total_reflection():
     assert shares[0] == pytest.approx(0.04) and shares[4] == 1  # ((1.5 - 1) / (1.5 + 1))^2
     assert shares[1] == pytest.approx(0.04 + 0.96 * (1 - np.cos(angles[1])) ** 5)
     assert (np.diff(shares[:3]) > 0).all()
+    # Leaving at 30 degrees, the ray has sin = 0.75 and cos = 0.6614378 in the air: 0.04 + 0.96 * 0.3385622^5.
+    assert shares[3] == pytest.approx(0.0442703, abs=1e-7)
+    assert shares[2] == pytest.approx(0.04 + 0.96 / 32)  # cos = 1 / 2
 
 
 def test_a_pane_shifts_what_is_behind_it():
@@ -146,6 +149,35 @@ def test_two_mirrors_that_face_each_other_end():
     assert_allclose(shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]])), 1)  # after three of them, the background
 
 
+def test_after_three_surfaces_a_ray_sees_through_the_next():
+    """Between mirrors that each reflect half, it keeps an eighth of the background."""
+    sides = np.array([[4.0, 0, 0], [0, 4.0, 0]])
+    walls = [surfaces_of(parallelogram(np.array([-2, -2, z]), sides), MIRROR, np.full(3, 0.5)) for z in (1.0, -1.0)]
+    world = demo.world_of(claims.random_gaussians(0, np.random.default_rng(0)), around(*walls), np.ones(3))
+    assert_allclose(shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]])), 0.125, rtol=CLOSED_FORM)
+
+
+def test_a_ray_ends_below_a_ten_thousandth_in_its_brightest_channel():
+    nobody = claims.random_gaussians(0, np.random.default_rng(0))
+    for color, is_kept in (([1.1e-4, 0.0, 1e-5], True), ([0.9e-4, 0.9e-4, 1e-5], False)):
+        mirror = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL), MIRROR, np.array(color))
+        seen = shade(demo.world_of(nobody, around(mirror), np.ones(3)), rays_of([[0, 0, 0]], [[0.0, 0, 1]]))
+        assert_allclose(seen, [color if is_kept else [0, 0, 0]], rtol=CLOSED_FORM)
+
+
+def test_glass_reflects_its_share_and_tints_what_it_lets_through():
+    """A red veil of opacity 1/2 before a sheet of glass of index 1.5, which reflects 0.04 of light that faces it.
+
+    Half is the veil's red. Of the other half, 0.04 comes back and passes the veil once more, and 0.96 goes on with the
+    tint: red ``0.5 + 0.5 (0.04 (0.5 + 0.5 * 0.25) + 0.96 * 0.8 * 0.25)``.
+    """
+    veil = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.array([[1.0, 0, 0]]))
+    glass = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL[::-1]), GLASS, np.array([0.8, 0.6, 0.4]))
+    world = demo.world_of(veil._replace(opacity_logits=np.zeros(1)), around(glass), np.array([0.25, 0.5, 0.75]))
+    seen = shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]]))
+    assert_allclose(seen, [[0.6085, 0.149, 0.1515]], rtol=1e-12)
+
+
 # --- meshes and shadows ---
 
 
@@ -170,6 +202,20 @@ def test_a_wall_is_lit_by_the_cosine_and_dark_behind_another():
     screen = surfaces_of(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
     dark = shade(demo.world_of(nobody, around(wall, screen, lights=lamp, ambient=0.2), BLACK), rays)
     assert_allclose(dark, 0.2)
+
+
+def test_lamps_share_the_light_and_gaussians_have_no_cosine():
+    """Lamps at 45 degrees and straight in front light a wall by ``0.2 + 0.8 (0.7071068 + 1) / 2``."""
+    wall = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
+    lamps = np.array([[1.0, 0.0, 2.0], [0.0, 0.0, 0.5]])
+    nobody, rays = claims.random_gaussians(0, np.random.default_rng(0)), rays_of([[0, 0, 0]], [[0.0, 0, 1]])
+    world = demo.world_of(nobody, around(wall, lights=lamps, ambient=0.2), BLACK)
+    assert_allclose(shade(world, rays), 0.8828427, atol=1e-7)
+    points = np.array([[0.0, 0, 2.9]])
+    assert_allclose(irradiance(world, points, None), 1, rtol=CLOSED_FORM)
+    screen = surfaces_of(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
+    half = demo.world_of(nobody, around(screen, lights=lamps, ambient=0.2), BLACK)
+    assert_allclose(irradiance(half, points, None), 0.6, rtol=CLOSED_FORM)
 
 
 def test_the_edge_of_a_shadow_is_where_the_tangent_cone_meets_the_floor():

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
@@ -21,9 +21,10 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.types import Projection, view_from
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Model, Projection, view_from
 from payloads import drawn, random_textures
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, PARITY_FLOAT64, TEXTURE_THIN_FLOAT32
 
 RENDERER = TEXTURED_GAUSSIANS.renderer
@@ -131,6 +132,28 @@ def test_textures_of_zeros_have_a_gradient(rng):
     """So training changes them; that they change no image is tested for all payloads."""
     _, v = drawn(RENDERER, with_textures(make_gaussians(rng, 30), 3), view_from(make_camera(rng=rng)), REFERENCE)
     assert np.abs(v.gaussians.color_textures).max() > 0 and np.abs(v.gaussians.opacity_textures).max() > 0
+
+
+@pytest.mark.parametrize("backend", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_where_a_texture_makes_a_colour_negative_it_is_black_and_has_no_gradient(backend):
+    """The camera looks along (0.8, 0, 0.6), so a ball on its axis is entered at n = (-0.8, 0, -0.6).
+
+    With ``Y_1 = C (-y, z, -x)`` the last coefficient counts 0.8 C = 0.3908820. Of a colour of 0.1, a coefficient of -2
+    takes 0.78, which leaves nothing, and 2 adds as much.
+    """
+    C, o, camera = 0.4886025119029199, 0.9, turned_camera(cx=17.5, cy=12.5)
+    ball = with_textures(balls(in_front_of(camera, [0, 0, 3.0]), [0.2], [o], [[0.1, 0.1, 0.1]]), 3)
+    ball.color_textures.reshape(1, 3, 15)[0, :2, 2] = [-2, 2]
+    ball.opacity_textures[0, 14] = 1e-300  # else it has no texture, and is a plain Gaussian
+    output, tape = RENDERER.render(Model(ball), view_from(camera), Request(backend=backend))
+    assert_allclose(output.image[12, 17], o * np.array([0, 0.1 + 1.6 * C, 0.1]), atol=1e-12)
+    v_image = np.zeros_like(output.image)
+    v_image[12, 17] = 1
+    v = RENDERER.render_vjp(tape, v_image, None).gaussians
+    assert_allclose(v.sh_dc, [[0, 0.28209479177387814 * o, 0.28209479177387814 * o]], rtol=1e-12)
+    v_textures = v.color_textures.reshape(3, 15)
+    assert_array_equal(v_textures[0], 0)
+    assert_allclose(v_textures[1:, :3], [[0, -0.6 * C * o, 0.8 * C * o]] * 2, atol=1e-12)
 
 
 # --- whole images ---

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
@@ -25,7 +25,7 @@ from minisplat_ref.runs.progress import Progress
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 RENDERER = MOVING.renderer
@@ -88,6 +88,22 @@ def test_a_moment_is_a_still_scene(time, backend, rng):
     expected, _ = SPLATTING.render(Model(there), view_from(camera), Request(backend=backend))
     assert_array_equal(output.image, expected.image, strict=True)
     assert_array_equal(output.visible_ids, expected.visible_ids)
+
+
+def test_velocities_begin_to_move_five_times_as_fast_as_the_means():
+    """In a scene of extent 2, the first step of Adam, which has no bias correction: 0.1 g / sqrt(0.001 g^2) of a rate.
+
+    That is 3.162 times 1.6e-4 times 2 for the means, wherever a Gaussian has a gradient.
+    """
+    camera = turned_camera()
+    points = in_front_of(camera, [[0.3, 0.2, 3.0], [-0.4, 0.1, 3.5], [0.2, -0.3, 4.0], [0.6, 0.5, 3.2]])
+    photograph = np.random.default_rng(0).integers(0, 256, (28, 40, 3), np.uint8)
+    view = View("one", camera, photograph, None, time=0.5)
+    scene = Scene("two", (view,), (), points, np.full((4, 3), 128, np.uint8), np.zeros(3), 2.0)
+    after = train(scene, find_recipe("velocity")._replace(iterations=1), seed=0).gaussians
+    moved = np.abs(after.means - points.astype(np.float32))
+    assert_allclose(moved, np.sqrt(10) * 3.2e-4, rtol=1e-3)  # float32, and a part of 30,000 of the way to 1.6e-6
+    assert_allclose(np.abs(after.velocities), np.sqrt(10) * 1.6e-3, rtol=1e-3)
 
 
 # Gradients and backends

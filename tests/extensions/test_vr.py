@@ -20,7 +20,7 @@ from minisplat_ref.extensions.vr.stages import stages
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Model, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM
 
 CAMERA = make_camera(80, 60, fx=60.0, fy=60.0)
@@ -57,7 +57,60 @@ def test_weights_add_up_and_never_draw_too_coarsely():
         assert not weight[angles < begins].any() and weight.max() == 1
 
 
+def test_the_acuity_by_hand():
+    """Guenter et al. 2012: 1/48 of a degree in the fovea, and 0.0275 degrees more per degree."""
+    assert_allclose(foveation.resolved_angles(np.array([0.0, 10.0])), [0.0208333333, 0.2958333333], rtol=1e-8)
+    # From 6 degrees on it doubles: 2 (1/48 + 0.165) = 1/48 + 0.0275 e at e = 12.7575...
+    assert_allclose(zone_begins(6.0), [0, 6, 12.757575757], rtol=1e-9)
+
+
+def test_a_ring_is_a_fifth_of_the_eccentricity_wide():
+    """Half way through it is half of each image; a quarter of the way, 3/16 - 2/64 of the coarser one."""
+    weights = np.array(zone_weights(np.array([6.0, 6.3, 6.6, 7.19, 7.2, 12.757575757 * 1.1]), 6.0))
+    quarter = 3 / 16 - 2 / 64
+    assert_allclose(weights[:, :3], [[1, 1 - quarter, 0.5], [0, quarter, 0.5], [0, 0, 0]], atol=1e-12)
+    assert 0 < weights[0, 3] < 1e-3 and weights[0, 4] == 0
+    assert_allclose(weights[:, 5], [0, 0.5, 0.5], atol=1e-8)
+
+
+def test_a_pixel_needs_its_block_and_those_around_it():
+    """Of 5 x 7 pixels in blocks of 2 x 2; a border has no blocks beyond it."""
+    is_needed = np.zeros((5, 7), bool)
+    is_needed[0, 6] = True
+    assert_array_equal(foveation._find_needed_samples(is_needed, 2), [[0, 0, 1, 1], [0, 0, 1, 1], [0, 0, 0, 0]])
+    is_needed[:], is_needed[2, 3] = False, True
+    assert_array_equal(foveation._find_needed_samples(is_needed, 2), [[1, 1, 1, 0]] * 3)
+    assert_array_equal(foveation._find_needed_samples(is_needed, 1), is_needed)
+
+
 # --- images ---
+
+
+def test_a_coarse_zone_shows_the_footprint_of_the_display():
+    """A ball of angular deviation s on its tangent plane: ``o exp(-tan(angle)^2 / (2 (s^2 + 0.3 / (fx fy))))``.
+
+    That is the low-pass of the whole image, though the rays are those of blocks of 4 x 4 pixels, whose middles are at
+    38 and 42 in x, at 22 and 26 in y. The pixels in between are interpolated.
+    """
+    camera = turned_camera(80, 60, fx=60.0, fy=45.0, cx=35.0, cy=28.0)
+    towards = np.array([(40 - 35) / 60, (24 - 28) / 45, 1.0])
+    r = 3.0 * np.linalg.norm(towards)
+    ball = balls(in_front_of(camera, 3.0 * towards), [0.02 * r], [0.9], [[1.0, 1.0, 1.0]])
+    image, _ = render_foveated(Model(ball), camera, Request(backend=REFERENCE), Gaze(2.0, 58.0, 0.0), BUFFER)
+
+    def sample(x, y):
+        d = np.array([(x - 35) / 60, (y - 28) / 45, 1.0])
+        tangent = np.linalg.norm(np.cross(d, towards)) / (d @ towards)
+        alpha = 0.9 * np.exp(-(tangent**2) / (2 * (0.02**2 + 0.3 / (60 * 45))))
+        return alpha if alpha >= 1 / 255 else 0.0
+
+    for x, y in ((40, 24), (39, 25), (38, 22)):
+        right, down = (x + 0.5 - 38) / 4, (y + 0.5 - 22) / 4
+        upper = (1 - right) * sample(38, 22) + right * sample(42, 22)
+        lower = (1 - right) * sample(38, 26) + right * sample(42, 26)
+        expected = (1 - down) * upper + down * lower
+        assert expected > 0.02
+        assert_allclose(image[y, x], expected, rtol=1e-10)
 
 
 def test_all_in_full_is_the_whole_image(rng):

@@ -64,7 +64,7 @@ def simplify_kinds(population: MixedGaussians, *, least: float, min_height: floa
     lengths[n == 2, 1:] = 0  # of a line only the first counts
     longest = lengths.max(axis=1)
     is_point = (n > 1) & (longest < least)
-    double = np.abs(y[:, 1, 0] * y[:, 2, 1] - y[:, 1, 1] * y[:, 2, 0])
+    double = 3 * np.abs(y[:, 1, 0] * y[:, 2, 1] - y[:, 1, 1] * y[:, 2, 0])  # the area: y is from the mean
     is_line = (n == 3) & ~is_point & (double < min_height * longest)
 
     rows = np.arange(len(n))
