@@ -17,7 +17,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.adaptive.exposure import begin_exposures
-from minisplat_ref.methods.adaptive.numbers import GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
+from minisplat_ref.methods.adaptive.numbers import COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
 from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
@@ -108,13 +108,13 @@ def is_over(pace: Pace, step: int) -> bool:
 def foreseen_costs(before_slices: Sequence[Measurement]) -> tuple[float, float]:
     """Return what the prune will have cost after one more slice: PSNR in dB, and SSIM.
 
-    The cost so far is the best value less the present one; one more slice is taken to cost what the last one did.
-    Before the first slice both are 0.
+    The cost so far is the best value less the present one; one more slice is taken to cost ``COST_RISE`` times what the
+    last one did. Before the first slice both are 0.
     """
     costs = []
     for values in ([m.psnr for m in before_slices], [m.ssim for m in before_slices]):
         last = max(0.0, values[-2] - values[-1]) if len(values) > 1 else 0.0
-        costs.append(max(values) - values[-1] + last)
+        costs.append(max(values) - values[-1] + COST_RISE * last)
     return costs[0], costs[1]
 
 
