@@ -257,7 +257,7 @@ def test_what_the_prune_will_have_cost():
     ("limits", "ends"), [((0.1, np.inf), "0.30 dB"), ((np.inf, 0.005), "0.0300 of SSIM"), ((1, 1), "")]
 )
 def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypatch, limits, ends):
-    """After a slice that cost 0.1 dB and 0.01 of SSIM, the next would make it three times as much; then all views train."""
+    """After a slice that cost 0.1 dB and 0.01 of SSIM, the next would make it thrice as much; then all train."""
     state, here = cooling
     values = iter(of_values([20.0, 19.9, 19.9], [0.50, 0.49, 0.49]))
     monkeypatch.setattr(prune, "evaluate_held_out", lambda *_, **__: next(values))
