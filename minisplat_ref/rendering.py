@@ -156,8 +156,8 @@ def activate(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
     """
     dtype = gaussians.means.dtype
     with np.errstate(over="ignore"):
-        # The largest finite number is culled like infinity, but infinity times a zero gradient would be NaN.
-        scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
+        # The largest number of float32 takes the place of infinity, which times a gradient of zero would be NaN.
+        scales = np.minimum(np.exp(gaussians.log_scales), dtype.type(np.finfo(np.float32).max))
         opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
     if is_visible is not None:
         opacities = np.where(is_visible, opacities, opacities.dtype.type(0))

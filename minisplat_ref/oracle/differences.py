@@ -67,6 +67,11 @@ class Block(NamedTuple):
         return self.size <= GRADIENT_FLOOR
 
 
+def largest_error(errors: Sequence[float]) -> float:
+    """Return the largest error; NaN if one is NaN, or if there is none."""
+    return float(np.max(errors)) if len(errors) else np.nan
+
+
 class JacobianCheck(NamedTuple):
     """Full Jacobians of a function, by differences and by its VJP."""
 
@@ -79,8 +84,8 @@ class JacobianCheck(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Largest error of a block."""
-        return max(block.error for block in self.blocks)
+        """Largest error of a block; NaN if one is NaN."""
+        return largest_error([block.error for block in self.blocks])
 
     @property
     def vacuous(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from minisplat_ref.oracle.differences import (
     careful_derivative,
     check_inner_products,
     check_jacobians,
+    largest_error,
 )
 from minisplat_ref.oracle.pieces import PIECES, SEED, tiny_setting
 from minisplat_ref.oracle.public_call import CALLS, Call, rasterization_stage
@@ -132,7 +133,7 @@ def jacobian_case(stage: Stage, differentiate: Differentiate = careful_derivativ
     problems += [f"nothing was checked about {name}" for name in check.vacuous]
     problems += [f"{check.n_refused} columns cross a threshold at every step"] if check.n_refused else []
     figures = {
-        "error": max((block.error for block in check.blocks), default=np.nan),
+        "error": largest_error([block.error for block in check.blocks]),
         "limit": limit,
         "step": check.step,
         "entries": sum(map(np.size, outputs)) * sum(map(np.size, inputs)),
@@ -157,7 +158,7 @@ def inner_product_case(
     ]
     step = min(p.step for p in products)
     figures = {
-        "error": max(p.error for p in products),
+        "error": largest_error([p.error for p in products]),
         "limit": _limit(step),
         "step": step,
         "entries": sum(map(np.size, outputs)) * sum(map(np.size, inputs)),
@@ -188,7 +189,7 @@ def autograd_cases(backend: Backend) -> list[Case]:
         errors = [_relative(got, expected) for got, expected in gradients]
         wrong = zip(ours.inputs, errors, strict=True)
         problems = [f"gradient with respect to {name} differs" for name, error in wrong if not error <= PEER_REL]
-        figures = {"error": max(errors), "limit": PEER_REL}
+        figures = {"error": largest_error(errors), "limit": PEER_REL}
         cases.append(_case(f"{ours.name}: {AUTOGRAD}", ours, outputs, figures, problems))
     return cases
 

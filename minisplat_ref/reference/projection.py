@@ -3,6 +3,9 @@
 A perspective map is not affine, so it is replaced by its first-order expansion at the mean: EWA splatting (Zwicker et
 al. 2002) equation (31), 3DGS equation (5), ``Sigma' = J W Sigma W^T J^T``. Left out: EWA's normalisation of the
 footprint; in 3DGS the opacity is that of the peak.
+
+Powers of scales leave the range of float32, from 1e9 pixels on in the determinant. Therefore scales above 1 are divided
+by a power of two, 2^m, which is exact, and so are covariances by 2^2m, until the footprint is inverted.
 """
 
 import numpy as np
@@ -20,7 +23,7 @@ from minisplat_ref.reference.pinhole import (
     slope_limits,
     with_principal_point,
 )
-from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, ProjectionGradient
+from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Projection, ProjectionGradient
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported
@@ -57,12 +60,13 @@ def project(
         Zeros in every field of a culled Gaussian.
     """
     camera = with_principal_point(camera, conventions)
-    x, *_, C, B = _expand(means, quats, scales, camera, conventions)
+    exponents = _exponents(scales)  # m
+    x, *_, C, B = _expand(means, quats, scales, exponents, camera, conventions)
     means2d, depths, det = pinhole(x, camera), x[:, 2], determinants(B)
-    conics = _entries(adjugates(B) / det[:, None, None])  # of Q
+    conics = np.ldexp(_entries(adjugates(B) / det[:, None, None]), -2 * exponents[:, None])  # of Q
     if conventions.is_antialiased:
         opacities = opacities * compensations(C, B)
-    radii, boxes = extents(means2d, B, opacities, camera, conventions)
+    radii, boxes = extents(means2d, np.ldexp(B, 2 * exponents[:, None, None]), opacities, camera, conventions)
 
     is_visible = (conventions.near_plane < depths) & (depths < conventions.far_plane)
     is_visible &= opacities >= conventions.alpha_min
@@ -119,12 +123,14 @@ def project_vjp(
     camera = with_principal_point(camera, conventions)
     rows = np.flatnonzero(projection.radii[:, 0] > 0)  # [V] visible
     v_means2d, v_depths, v_conics, v_opacities = (field[rows] for field in v_projection)
-    x, J, Sigma, A, C, B = _expand(means[rows], quats[rows], scales[rows], camera, conventions)
+    exponents = _exponents(scales[rows])  # m
+    x, J, Sigma, A, C, B = _expand(means[rows], quats[rows], scales[rows], exponents, camera, conventions)
     R, _ = pose(camera, means.dtype)
     low, high = slope_limits(camera, conventions, means.dtype)
 
     Q = adjugates(B) / determinants(B)[:, None, None]
-    v_B = -Q @ _symmetric(v_conics * np.array([1, 0.5, 1], dtype=means.dtype)) @ Q
+    v_conics = np.ldexp(v_conics * np.array([1, 0.5, 1], dtype=means.dtype), -2 * exponents[:, None])
+    v_B = -Q @ _symmetric(v_conics) @ Q
     v_C = v_B  # B = C + eps I
     if conventions.is_antialiased:
         v_C = v_B + compensations_vjp(C, B, opacities[rows] * v_opacities)
@@ -133,7 +139,8 @@ def project_vjp(
     v_Sigma = np.swapaxes(A, 1, 2) @ v_C @ A
     v_x = pinhole_vjp(x, camera, v_means2d) + pinhole_jacobians_vjp(x, camera, low, high, v_A @ R.T)
     v_x[:, 2] += v_depths
-    v_quats, v_scales = covariances_vjp(quats[rows], scales[rows], v_Sigma)
+    v_quats, v_scales = covariances_vjp(quats[rows], np.ldexp(scales[rows], -exponents[:, None]), v_Sigma)
+    v_scales = np.ldexp(v_scales, -exponents[:, None])
     return PrimitiveGradient(
         means=_scatter(v_x @ R, rows, len(means)),
         quats=_scatter(v_quats, rows, len(means)),
@@ -144,17 +151,25 @@ def project_vjp(
     )
 
 
+def _exponents(scales: Floats) -> Ints:
+    """Return m [N] such that no scale is larger than 2^m; 0 where all are below 1."""
+    return np.maximum(np.frexp(scales.max(axis=1))[1], 0)
+
+
 def _expand(
-    means: Floats, quats: Floats, scales: Floats, camera: Camera, conventions: Conventions
+    means: Floats, quats: Floats, scales: Floats, exponents: Ints, camera: Camera, conventions: Conventions
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Return x [N, 3], J [N, 2, 3], Sigma [N, 3, 3], A [N, 2, 3], C and B [N, 2, 2] of :func:`project`."""
+    """Return x [N, 3], J [N, 2, 3], Sigma [N, 3, 3], A [N, 2, 3], C and B [N, 2, 2] of :func:`project`.
+
+    Sigma, C and B are divided by 2^2m.
+    """
     R, t = pose(camera, means.dtype)
     x = means @ R.T + t
     J = pinhole_jacobians(x, camera, *slope_limits(camera, conventions, means.dtype))
-    Sigma = covariances(quats, scales)
+    Sigma = covariances(quats, np.ldexp(scales, -exponents[:, None]))
     A = J @ R
     C = A @ Sigma @ np.swapaxes(A, 1, 2)
-    B = C + conventions.eps2d * np.eye(2, dtype=means.dtype)
+    B = C + np.ldexp(means.dtype.type(conventions.eps2d), -2 * exponents)[:, None, None] * np.eye(2, dtype=means.dtype)
     return x, J, Sigma, A, C, B
 
 

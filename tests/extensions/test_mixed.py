@@ -36,10 +36,11 @@ from minisplat_ref.extensions.mixed.response import INSIDE, RESPONSE, HullFootpr
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.tiling import bin_gaussians
+from minisplat_ref.rendering import Request
 from minisplat_ref.studies.kit import psnr_of
-from minisplat_ref.types import Primitives, Projection, TileGrid, view_from
+from minisplat_ref.types import Model, Primitives, Projection, TileGrid, view_from
 from payloads import drawn
-from scenes import as_dtype, balls, make_camera, make_gaussians
+from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, HULL_COVERAGE, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, TANGENT_LEVEL
 
 Q = np.array([[[0.31, 0.12], [0.12, 0.2]]])  # px^-2
@@ -243,6 +244,15 @@ def test_an_empty_hull_is_its_ellipse_and_a_flat_one_its_longest_line(rng):
     far = start + rng.uniform(-40, 40, size=(200, 1)) * along  # on its line
     for pixels in (centers, far):
         assert_allclose(alphas(flat, 3, pixels), alphas(flat, 2, pixels), rtol=1e3 * CLOSED_FORM)
+
+
+def test_a_hull_far_below_a_pixel_is_drawn_by_its_low_pass(backend):
+    """Its footprint is the low-pass, a covariance of 0.3 pixels squared whose determinant is 0.09."""
+    camera = turned_camera(cx=17.5, cy=12.5)
+    speck = as_ellipses(balls(in_front_of(camera, [0, 0, 5.0]), [1e-7], [0.8], [[1.0, 1.0, 1.0]]))
+    speck = speck._replace(vertices=np.array([[1e-7, 0, 0, 1e-7]]), n_vertices=np.array([3.0]))
+    image = RENDERER.render(Model(speck), view_from(camera), Request(backend=backend))[0].image
+    assert_allclose(image[12, 17:19, 0], [0.8, 0.8 * np.exp(-0.5 / 0.3)], rtol=1e-4)
 
 
 def test_a_hull_with_a_vertex_behind_the_camera_is_culled():

@@ -344,12 +344,20 @@ def test_hard_gaussians_are_finite_and_the_same_in_both(mean, scales, rng):
 
 
 def test_what_cannot_be_drawn_is_culled(backend, rng):
-    hopeless = [([0, 0, 0], [0.1] * 3), ([0, 0, 5e11], [0.1] * 3), ([0, 0, -3], [0.1] * 3), ([0, 0, 3], [np.inf] * 3)]
-    for mean, scales in hopeless:
-        gaussians = as_gaussians(one(mean, scales, 0.8), rng)
+    for mean in ([0, 0, 0], [0, 0, 5e11], [0, 0, -3]):
+        gaussians = as_gaussians(one(mean, [0.1] * 3, 0.8), rng)
         output, tape = DRAW.render(Model(gaussians), view_from(make_camera()), Request(backend=backend))
         assert output.alpha.max() == 0 and len(output.visible_ids) == 0
         assert not DRAW.render_vjp(tape, np.ones((18, 24, 3)), None).gaussians.means.any()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_infinite_scale_counts_as_the_largest_number_and_covers_everything(backend, dtype, rng):
+    gaussians = as_dtype(as_gaussians(one([0, 0, 3], [np.inf] * 3, 0.8), rng), dtype)
+    output, tape = DRAW.render(Model(gaussians), view_from(make_camera()), Request(backend=backend))
+    assert_allclose(output.alpha, 0.8, rtol=1e-6)
+    v = DRAW.render_vjp(tape, np.ones((18, 24, 3), dtype), None).gaussians
+    assert all(np.isfinite(field).all() for field in v)
 
 
 def test_no_gaussians(backend, rng):

@@ -100,6 +100,14 @@ def test_masses_are_the_area(rng):
     assert masses[-1] > 0  # of a vertex without triangles
 
 
+def test_the_stiffness_of_a_sheet_by_hand():
+    """A cell of 2 x 1 has sides of 2, 2, 1 and 1 and a diagonal of sqrt(5): k = 2 (10 / 4) / (2 e^2 0.1)."""
+    mesh = grid(np.array([5.0, -3, 7]), np.array([0.0, 2.0, 0]), np.array([0, 0, 1.0]), (1, 1))
+    edge = (6 + np.sqrt(5)) / 5
+    k = 25 / edge**2
+    assert_allclose(stiffness_for_stretch(mesh, 10.0, 0.1), [k, k, k / 100], rtol=CLOSED_FORM)
+
+
 # Forces
 
 

@@ -14,12 +14,15 @@ from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.differences import (
     CENTRAL,
     SIXTH_ORDER,
+    Block,
+    JacobianCheck,
     Point,
     ThresholdCrossed,
     careful_derivative,
     check_inner_products,
     check_jacobians,
     derivative,
+    largest_error,
     settled_derivative,
 )
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
@@ -281,3 +284,13 @@ def test_a_derivative_on_a_kink_does_not_settle(at):
 
     with pytest.raises(ThresholdCrossed):
         settled_derivative(kinked, [ONE], 0, ONE)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_the_largest_error_is_nan_where_one_is(place):
+    """Whichever comes first: Python's ``max`` returns the larger of the others where NaN is not the first."""
+    errors = [0.1, 0.3, 0.2]
+    errors[place] = np.nan
+    blocks = tuple(Block("y", "x", 1.0, error) for error in errors)
+    assert np.isnan(JacobianCheck(blocks, 1e-6, 0).error) and np.isnan(largest_error([]))
+    assert JacobianCheck(blocks[:place] + blocks[place + 1 :], 1e-6, 0).error == (0.2 if place == 1 else 0.3)

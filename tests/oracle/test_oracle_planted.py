@@ -120,8 +120,9 @@ EQUIVALENT = {
     " -> pinhole_jacobians(means_cam, camera, 0.5 * -limits, limits)": "half of infinity",
     "pinhole_vjp: pinhole_jacobians(means_cam, camera, -limits, limits)"
     " -> pinhole_jacobians(means_cam, camera, -limits, 0.5 * limits)": "half of infinity",
-    "project_vjp: _expand(means[rows], quats[rows], scales[rows], camera, conventions)"
-    " -> _expand(means[rows], 0.5 * quats[rows], scales[rows], camera, conventions)": HOMOGENEOUS,
+    "project_vjp: _expand(means[rows], quats[rows], scales[rows], exponents, camera, conventions)"
+    " -> _expand(means[rows], 0.5 * quats[rows], scales[rows], exponents, camera, conventions)": HOMOGENEOUS,
+    "project_vjp: _exponents(scales[rows]) -> _exponents(0.5 * scales[rows])": "any power of two serves, and cancels",
     "sh_basis_jacobian: SH_C1 * one -> SH_C1 / one": ONES,
     "sh_basis_jacobian: -SH_C1 * one -> -SH_C1 / one": ONES,
     "conic_hit_vjp: np.einsum('gp,gij,gpj->gi', -unclamped * v_mean, Q, offsets)"

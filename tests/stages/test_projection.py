@@ -14,8 +14,19 @@ from minisplat_ref.reference.pinhole import (
     pinhole_vjp,
     slope_limits,
 )
-from minisplat_ref.types import Camera, ProjectionGradient, TileGrid
-from scenes import ALL_CONVENTIONS, ANTIALIASED, activated, as_dtype, make_camera, make_gaussians
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.types import Camera, Model, ProjectionGradient, TileGrid, view_from
+from scenes import (
+    ALL_CONVENTIONS,
+    ANTIALIASED,
+    activated,
+    as_dtype,
+    balls,
+    in_front_of,
+    make_camera,
+    make_gaussians,
+    turned_camera,
+)
 from tolerances import CLOSED_FORM, GRADIENT_FLOOR, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_PROJECTION, PARITY_FLOAT64
 
 CAMERA = Camera(np.eye(3), np.zeros(3), 100.0, 50.0, 32.0, 24.0, 64, 48)
@@ -400,3 +411,42 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
             assert a.dtype == (np.float64 if a is actual.conics else dtype)
             assert np.abs(e).max() > GRADIENT_FLOOR
             assert_allclose(a, e, rtol=0, atol=tolerance * np.abs(e).max())
+
+
+# --- scales whose squares no float32 holds ---
+
+
+@pytest.mark.parametrize("log_scale", [20.0, 43.0, 88.0, 200.0])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_enormous_gaussian_covers_everything(backend, dtype, log_scale):
+    """With opacity 1/2 it is 1/2 everywhere. Its gradients are finite, that of the logit is 1/4 for each pixel."""
+    camera = turned_camera()
+    ball = balls(in_front_of(camera, [0.0, 0.0, 3.0]), [1.0], [0.5])
+    model = Model(as_dtype(ball._replace(log_scales=np.full((1, 3), log_scale)), dtype))
+    output, tape = SPLATTING.render(model, view_from(camera), Request(backend=backend))
+    assert_allclose(output.alpha, 0.5, rtol=1e-6)
+    v = SPLATTING.render_vjp(tape, np.zeros_like(output.image), np.ones_like(output.alpha)).gaussians
+    assert all(np.isfinite(field).all() for field in v)
+    assert_allclose(v.opacity_logits, 0.25 * 40 * 28, rtol=1e-5)
+
+
+@pytest.mark.parametrize("exponent", [1, 7, 40])
+def test_dividing_by_powers_of_two_changes_no_bit(exponent, rng):
+    """The scene twice as large seen from twice as far has the same footprints, without the low-pass."""
+    camera, gaussians = make_camera(rng=rng), make_gaussians(rng, 30, sh_degree=0, size=0.6)
+    conventions = GSPLAT_MAIN._replace(eps2d=0.0, near_plane=1e-12, far_plane=np.inf)
+    means, quats, scales, opacities = activated(gaussians)
+    expected = REFERENCE.project(means, quats, scales, opacities, camera, conventions)
+    factor = 2.0**exponent
+    larger = camera._replace(cam_from_world_t=factor * camera.cam_from_world_t)
+    found = REFERENCE.project(factor * means, quats, factor * scales, opacities, larger, conventions)
+    assert np.count_nonzero(expected.radii[:, 0]) > 20
+    for name in ("means2d", "conics", "opacities", "radii", "boxes"):
+        assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+    v = ProjectionGradient(rng.normal(size=(30, 2)), np.zeros(30), rng.normal(size=(30, 3)), rng.normal(size=30))
+    v_expected = REFERENCE.project_vjp(means, quats, scales, opacities, camera, conventions, expected, v)
+    v_found = REFERENCE.project_vjp(factor * means, quats, factor * scales, opacities, larger, conventions, found, v)
+    for name in ("means", "scales"):
+        assert_array_equal(factor * getattr(v_found, name), getattr(v_expected, name), err_msg=name)
+    for name in ("quats", "opacities"):
+        assert_array_equal(getattr(v_found, name), getattr(v_expected, name), err_msg=name)

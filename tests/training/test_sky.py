@@ -162,6 +162,27 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
+def test_training_says_that_the_ply_has_no_sky(tmp_path, capsys):
+    options = ["--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "60"]
+    assert main(["synthetic", "outdoor", "--out", str(tmp_path / "scene"), *options]) == 0
+    training = ["--recipe", "3dgs-accel", "--iterations", "2", "--test-every", "4"]
+    for name, wanted, words in (
+        ("none", [], None),
+        ("sky", ["--set", "sky=true"], "does not hold the sky, which"),
+        (
+            "both",
+            ["--set", "sky=true", "--set", "antialiasing=true"],
+            "the sky and the compensation of opacities, which",
+        ),
+    ):
+        capsys.readouterr()
+        run = tmp_path / name
+        assert main(["train", str(tmp_path / "scene"), "--out", str(run), *training, *wanted]) == 0
+        out = capsys.readouterr().out
+        assert ("does not hold" in out) == (words is not None)
+        assert words is None or (words in out and f"minisplat-ref render {run} has all" in out)
+
+
 def test_a_run_keeps_its_sky(run, tmp_path, capsys):
     """Also one that was decided upon: ``config.json`` does not ask for it, the shared parameters are there."""
     with np.load(run / "shared.npz") as archive:

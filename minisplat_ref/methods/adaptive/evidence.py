@@ -174,5 +174,10 @@ def _halves_beside_slopes(
     state: TrainState, iteration: Iteration, view_ids: Sequence[int]
 ) -> Iterator[tuple[Half, Half]]:
     for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
-        slopes = np.stack([np.gradient(rendered, axis=1), np.gradient(rendered, axis=0)])  # [2, H, W, 3] along u, v
-        yield halves_of(photograph - rendered, slopes, is_counted)
+        yield halves_of(photograph - rendered, slopes(rendered), is_counted)
+
+
+def slopes(image: Floats) -> Floats:
+    """Return the derivatives [2, H, W, 3] of an image along u and v, per pixel; 0 across an image one pixel wide."""
+    axes = (1, 0)
+    return np.stack([np.gradient(image, axis=a) if image.shape[a] > 1 else np.zeros_like(image) for a in axes])

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
-from minisplat_ref.methods.adaptive.evidence import Evidence, Half, displacements, halves_of, weigh
+from minisplat_ref.methods.adaptive.evidence import Evidence, Half, displacements, halves_of, slopes, weigh
 from minisplat_ref.methods.adaptive.pose import hold_mean_pose, rotation_of, turn_held_out
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.switches import switch_pose_on
@@ -50,6 +50,27 @@ def test_masked_pixels_are_in_neither_half():
     for half, other in zip(halves_of(poisoned, fields, mask), halves_of(residual, fields, mask), strict=True):
         assert_array_equal(half.normal, other.normal)
         assert half.energy == other.energy
+
+
+def test_slopes_by_hand():
+    """Half the difference of both neighbours, the whole one at a border, and none across a single row or column."""
+    row = np.array([[0.0, 1.0, 4.0, 9.0]])[..., None] * np.array([1.0, 0.0, -2.0])
+    along_u, along_v = slopes(row)
+    assert_array_equal(along_u[0], np.outer([1, 2, 4, 5], [1, 0, -2]))
+    assert_array_equal(along_v, np.zeros((1, 4, 3)))
+    assert_array_equal(slopes(row.swapaxes(0, 1)), [np.zeros((4, 1, 3)), along_u.swapaxes(0, 1)])
+
+
+@pytest.mark.parametrize("size", [(1, 24), (24, 1), (1, 1)])
+def test_photographs_one_pixel_wide_or_high_are_trained_on(size, rng):
+    width, height = size
+    cameras = [make_camera(width, height, fx=30.0, fy=30.0, rng=rng) for _ in range(6)]
+    images = rng.integers(0, 256, (6, height, width, 3), np.uint8)
+    views = tuple(View(f"view{i}", cameras[i], images[i], None, view_id=i) for i in range(6))
+    points, colors = make_gaussians(rng, 30).means, np.full((30, 3), 128, np.uint8)
+    scene = Scene("slit", views, (), points, colors, BACKGROUND, 1.0)
+    state = train(scene, ADAPTIVE._replace(iterations=520, starts_densely=False), seed=0, backend=CPU)
+    assert len(state.gaussians.means) > 0 and np.isfinite(state.gaussians.means).all()
 
 
 def photographs_of(x, noise, rng):
