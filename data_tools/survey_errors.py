@@ -236,14 +236,14 @@ _LOSS_AND_ADAM = (
     PlantedLine(
         "corrections of the step before",
         "training.adam:adam_step",
-        "step = state.step + 1",
-        "step = max(1, state.step)",
+        "state.step + 1 - state.joined.get(name, 0)",
+        "max(1, state.step - state.joined.get(name, 0))",
     ),
     PlantedLine(
         "eps without its correction",
-        "training.adam:adam_step",
-        "rule.eps * (math.sqrt(1 - rule.beta2**step) if",
-        "rule.eps * (1.0 if",
+        "training.adam:_update_of",
+        "rule.eps * root",
+        "rule.eps",
     ),
     PlantedLine(
         "kernels: eps inside the root",
