@@ -1,5 +1,7 @@
 """``photos``: from photographs to a report and a film, what it prints, and that it continues."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -26,8 +28,9 @@ def photos(out, *options):
 
 
 def steps_of(text):
-    """Return the first words of the commands that were printed and run."""
-    return [line.split()[2] for line in text.splitlines() if line.startswith("$ ")]
+    """Return the commands that were printed and run, however the program was started."""
+    programs = r"\$ .*?minisplat[_-]ref (\S+)"
+    return [match[1] for match in map(re.compile(programs).match, text.splitlines()) if match]
 
 
 def test_from_photographs_to_a_film(tmp_path, capsys):
