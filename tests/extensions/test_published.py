@@ -220,6 +220,9 @@ MICRO = {
         merge_alike=[steps(15_000, 24_000, 1_000)],
         merge_alike__merge_reach=1.0,
         merge_alike__merge_color=0.1,
+        prune_least=[steps(15_000, 24_000, 1_000)],
+        prune_least__score_mass=0.99,
+        prune_least__min_gap=100,
     ),
 }
 
