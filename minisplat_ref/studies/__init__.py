@@ -7,6 +7,7 @@
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
 :data:`MAX_DROP`            :mod:`..runs.max_drop_study`: what ``simplify --max-drop`` promises, and what it keeps
+:data:`MESH`                :mod:`..runs.mesh_study`: meshes of runs against the exact surface of synthetic scenes
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians start again
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
@@ -58,7 +59,7 @@ _CALIBRATION = (
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that users type; an extension's are EXTENSION/NAME."""
-    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, MAX_DROP, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
+    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, MAX_DROP, MESH, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
     return {each.name: each for each in studies}
 
 
@@ -180,6 +181,22 @@ MAX_DROP = declare(
     _CONDITION,
     SEEDS,
     description=f"Train a scene, simplify to each limit, and measure what test views lose. {CONTINUES}",
+)
+MESH = declare(
+    "mesh",
+    "meshes of runs against the exact surface of a synthetic scene",
+    "minisplat_ref.runs.mesh_study.run",  # which makes meshes of runs, and so is above this layer
+    _SYNTHETIC_SCENE,
+    RESUMED_OUT,
+    argument(
+        "--recipes",
+        type=list_of(name),
+        default=("3dgs-accel", "mini-splatting2", "adaptive"),
+        metavar="R,Q",
+        help="names as in train --recipe (default 3dgs-accel,mini-splatting2,adaptive)",
+    ),
+    iterations(2000),
+    SEEDS,
 )
 DEPTH = declare(
     "depth",
