@@ -20,7 +20,7 @@ imported when a study runs. :mod:`.study`, :mod:`.kit` and :mod:`.figures` have 
 extensions, and :mod:`.conditions` how they disturb a scene.
 """
 
-from minisplat_ref.arguments import SYNTHETIC_SCENES, decibels, fraction, list_of, name
+from minisplat_ref.arguments import decibels, fraction, list_of, name
 from minisplat_ref.studies.study import (
     CONTINUES,
     OUT,
@@ -38,6 +38,7 @@ from minisplat_ref.studies.study import (
     one_of,
     recipe,
     seed,
+    synthetic_scene,
 )
 
 CONDITION_HELP = (
@@ -46,7 +47,7 @@ CONDITION_HELP = (
 )
 _CONDITION = argument("--condition", type=name, default="whole", metavar="C", help=f"{CONDITION_HELP} (default whole)")
 _RESUMED_SCENE = (SCENE, RESUMED_OUT, downscale())
-_SYNTHETIC_SCENE = argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
+_SYNTHETIC_SCENE = synthetic_scene()
 _CALIBRATION = (
     _SYNTHETIC_SCENE,
     OUT,
