@@ -116,14 +116,10 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train and measure."""
     scene = kit.read_scene(args.scene)
     found = measure(scene, args.downscale, args.iterations, args.seeds)
-    rows = [
-        [
-            name,
-            f"{np.mean(found.counts[name.partition(',')[0]]):,.0f}",
-            *(with_range(values, 2) for values in zip(*runs, strict=True)),
-        ]
-        for name, runs in found.psnr.items()
-    ]
+    rows = []
+    for name, runs in found.psnr.items():
+        count = np.mean(found.counts[name.partition(",")[0]])
+        rows.append([name, f"{count:,.0f}", *(with_range(values, 2) for values in zip(*runs, strict=True))])
     table = markdown_table(["recipe", "Gaussians", *(f"x {zoom:g}" for zoom in found.zooms)], rows)
     result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
     result |= {"zooms": found.zooms, "psnr": found.psnr, "counts": found.counts}
