@@ -1,6 +1,7 @@
 """Files that say who draws them, end to end: each extension, each format, each command that reads them."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -70,7 +71,8 @@ def test_a_ply_is_drawn_like_its_run(name, run_of, tmp_path, capfd):
     expected = images(run, tmp_path / "run", "--cameras", "all")
     capfd.readouterr()
     assert images(run / "point_cloud.ply", tmp_path / "ply", "--cameras", run / "cameras.json") == expected
-    assert "warning" not in capfd.readouterr().err and len(expected) == SCENE["n_views"] + 1
+    assert "warning" not in capfd.readouterr().err
+    assert len(expected) == len(json.loads((run / "cameras.json").read_text())) >= SCENE["n_views"]
     assert main(["info", str(run / "point_cloud.ply")]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert ["drawn", "by", "extension", name] in [line.split() for line in lines]
@@ -221,12 +223,22 @@ def test_an_edit_keeps_who_draws_it(run_of, skies, tmp_path):
 
 
 def test_commands_that_draw_themselves_say_so(run_of, tmp_path, capfd):
-    ply = run_of("analytic") / "point_cloud.ply"
-    assert main(["rays", "render", str(ply), "--frames", "1", "--out", str(tmp_path / "traced")]) == 0
-    assert "says that extension analytic draws it: rays render draws it otherwise" in capfd.readouterr().err
-    ply = run_of("rays") / "point_cloud.ply"
-    assert main(["rays", "render", str(ply), "--frames", "1", "--out", str(tmp_path / "same")]) == 0
-    assert "warning" not in capfd.readouterr().err
+    (tmp_path / "lights.json").write_text('{"lights": [[0, 0, -2]]}')
+    trace = ["--scene", tmp_path / "lights.json", "--cameras", run_of("rays") / "cameras.json"]
+    gaze = ["--gaze", "10,10"]
+    for name, other, command, options in (
+        ("rays", "analytic", "rays render", trace),
+        ("vr", "analytic", "vr render", gaze),
+        ("vr", "antialiasing", "vr render", gaze),
+    ):
+        for drawn_by in (name, other):
+            ply, out = run_of(drawn_by) / "point_cloud.ply", tmp_path / f"{command}-{drawn_by}"
+            capfd.readouterr()
+            assert main([*command.split(), str(ply), *map(str, options), "--out", str(out)]) == 0
+            warnings = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
+            says = f"says that extension {other} draws it: {command} draws it otherwise"
+            assert len(warnings) == (drawn_by == other) and all(says in line for line in warnings)
+            shutil.rmtree(out)
 
 
 def test_a_choice_by_hand(tmp_path, recwarn):
@@ -273,7 +285,7 @@ def test_an_extension_whose_save_knows_no_label(tmp_path, monkeypatch):
 
 
 def test_fuse(run_of, tmp_path, capfd):
-    """Six fields for any viewer; scales and opacities of hand-worked values: s' = sqrt(s^2 + f^2), o' = o prod s / s'."""
+    """Six fields for any viewer, with s' = sqrt(s^2 + f^2) and o' = o prod s / s' worked out here."""
     from minisplat_ref.extensions.antialiasing.method import FilteredGaussians
 
     run, out = run_of("antialiasing"), tmp_path / "fused.ply"
