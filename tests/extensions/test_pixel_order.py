@@ -400,7 +400,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
     assert '"buffer_size": 8' in json.dumps(config)
     assert main(["eval", str(run)]) == 0
     assert (
-        main(["render", str(run / "point_cloud.ply"), "--extension", "pixel-order", "--frames", "1", "--size", "24x18"])
+        main(["render", str(run / "point_cloud.ply"), "--frames", "1", "--size", "24x18"])
         == 0
     )
     capsys.readouterr()
