@@ -77,9 +77,10 @@ def write_file(path: Path, format_: Format, content: bytes, label: Label) -> Non
     InputError
         As for :func:`write_content`, or another program's file is where the label should be; nothing is written then.
     """
-    if format_.write_label is None:
-        write_sidecar(path, content, label)
-    write_content(path, content)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+        if format_.write_label is None:  # first, so that the file is never there without it
+            write_sidecar(path, content, label)
 
 
 def label_of(path: Path, format_: Format, content: bytes) -> Label:

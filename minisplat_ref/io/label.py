@@ -1,8 +1,8 @@
 """What a file of Gaussians says about how it is drawn: its label.
 
-The numbers of a file do not tell which renderer they were trained for: as 3DGS, traced, filtered or integrated Gaussians
-are drawn without complaint, and worse. Nor does a file hold what every view shows besides Gaussians, such as
-a sky. So a file names the extension that draws it, and what it lacks of its run:
+The numbers of a file do not tell which renderer they were trained for: 3DGS draws traced, filtered or integrated
+Gaussians without complaint, and worse. Nor does a file hold what every view shows besides Gaussians, such as a sky. So
+a file names the extension that draws it, and what it lacks of its run:
 
 - a PLY in comments of its header, ``comment minisplat_ref extension NAME`` and ``comment minisplat_ref lacks PART``;
 - a compact format of ours in its own header (:class:`minisplat_ref.io.formats.Format`);

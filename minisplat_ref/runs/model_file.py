@@ -69,7 +69,7 @@ def recorded_owner(path: Path, label: Label) -> Extension:
     if label.extension not in folders():
         raise InputError(
             f"{path} is drawn by extension {label.extension}, which is not installed: let {VARIABLE} name the folder"
-            f" that it is in, or give --extension {CORE.name} to draw what 3DGS knows of it"
+            f" that it is in; render and convert take --extension {CORE.name} for what 3DGS knows of it"
         )
     return load_extension(label.extension)
 

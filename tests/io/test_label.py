@@ -1,5 +1,6 @@
 """The label of a file: comments of a PLY, an entry of our formats, a sidecar beside those of others."""
 
+import errno
 import json
 import struct
 
@@ -192,3 +193,15 @@ def test_labels_survive():
     assert labels.from_json(json.loads(json.dumps(labels.to_json(RAYS))), "a") == RAYS
     assert labels.from_comments(labels.to_comments(RAYS), "a") == RAYS
     assert labels.to_comments(NO_LABEL) == []
+
+
+def test_a_full_disk_leaves_neither_file_nor_sidecar(tmp_path, monkeypatch):
+    def write_bytes(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    content = SPZ.encode(population(), 0)
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.write_bytes", write_bytes)
+        with pytest.raises(InputError, match=r"a\.spz cannot be written \(No space left"):
+            write_file(tmp_path / "a.spz", SPZ, content, RAYS)
+    assert not list(tmp_path.iterdir())
