@@ -54,7 +54,7 @@ def add_parser(commands: Commands) -> None:
         "--downscale", type=integer(1), metavar="D", help="how much smaller they are made (default: the run's, or 1)"
     )
     parser.add_argument(
-        "--extension", metavar="E", help="that draws a file, core for 3DGS (default: what the file says, and else 3DGS)"
+        "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
     )
     parser.set_defaults(run=run)
 

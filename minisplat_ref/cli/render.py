@@ -63,7 +63,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
     parser.add_argument(
-        "--extension", metavar="E", help="that draws a file, core for 3DGS (default: what the file says, and else 3DGS)"
+        "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
     )
     parser.add_argument(
         "--frames", type=integer(1), default=60, metavar="N", help="number of images of an orbit (default 60)"
