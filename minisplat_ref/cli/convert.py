@@ -53,13 +53,15 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--downscale", type=integer(1), metavar="D", help="how much smaller they are made (default: the run's, or 1)"
     )
-    parser.add_argument("--extension", metavar="E", help="that a PLY was trained with (a run knows its own)")
+    parser.add_argument(
+        "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
+    )
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
-    from minisplat_ref.io.formats import write_content
+    from minisplat_ref.io.formats import write_file
     from minisplat_ref.runs.conversion import check_population, choose_format, encode_as, open_source
 
     out: Path = args.output
@@ -74,13 +76,13 @@ def run(args: argparse.Namespace) -> int:
                 f"a PLY has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out, or choose a"
                 " compact format"
             )
-        source.owner.save(out, source.model.gaussians)
+        source.owner.save(out, source.model.gaussians, source.label)
         lines = []
     else:
         check_population(source.model.gaussians, format_, source.what)
-        format_ = format_._replace(encode=partial(encode_as, format_, out))
+        format_ = format_._replace(encode=partial(encode_as, format_, out, source.label))
         choice, measured = _choose(args, source, format_)
-        write_content(out, choice.content)
+        write_file(out, format_, choice.content, source.label)
         rows = [*format_.describe(choice.content, out), *measured]
         lines = [f"  {name}: {value}" for name, value in rows]
     size = f"{out.stat().st_size:,} bytes"

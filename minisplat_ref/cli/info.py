@@ -2,14 +2,16 @@
 
 import argparse
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.arguments import Commands, HelpFormatter
-from minisplat_ref.errors import InputError, one_line
+from minisplat_ref.errors import InputError, InputWarning, one_line
 
 if TYPE_CHECKING:
+    from minisplat_ref.io.label import Label
     from minisplat_ref.runs.settings import Settings
     from minisplat_ref.types import Floats
 
@@ -75,16 +77,32 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _ply_rows(path: Path) -> Rows:
-    from minisplat_ref.io.ply import further_properties, load_ply
+    from minisplat_ref.extensions.extension import CORE
+    from minisplat_ref.io.ply import further_properties, read_label
+    from minisplat_ref.runs.model_file import read_population, recorded_owner
 
-    rows = [("PLY", _size(path)), *_field_rows(load_ply(path)._asdict())]
-    further = ", ".join(further_properties(path))
+    label = read_label(path)
+    try:
+        owner = recorded_owner(path, label)
+    except InputError as error:  # what 3DGS knows of it can be described all the same
+        warnings.warn(str(error), InputWarning, stacklevel=2)
+        owner = CORE
+    rows = [("PLY", _size(path)), *_label_rows(label), *_field_rows(read_population(path, owner)._asdict())]
+    further = ", ".join(further_properties(path)) if owner is CORE else ""
     return [*rows, *([("further properties", further)] if further else [])]
+
+
+def _label_rows(label: "Label") -> Rows:
+    """Say how a file is drawn, and what it lacks of its run."""
+    from minisplat_ref.runs.model_file import describe_parts
+
+    rows = [] if label.extension is None else [("drawn by extension", label.extension)]
+    return [*rows, *([("lacks", f"{describe_parts(label.lacks)} of its run")] if label.lacks else [])]
 
 
 def _compact_rows(path: Path) -> Rows:
     from minisplat_ref.extensions.extension import all_formats, find_format
-    from minisplat_ref.io.formats import read_content
+    from minisplat_ref.io.formats import label_of, read_content
 
     format_ = find_format(path)
     if format_ is None:
@@ -94,7 +112,8 @@ def _compact_rows(path: Path) -> Rows:
         )
     content = read_content(path)
     fields = format_.decode(content, path)._asdict()
-    return [(format_.suffix, _size(path)), *format_.describe(content, path), *_field_rows(fields)]
+    label = _label_rows(label_of(path, format_, content))
+    return [(format_.suffix, _size(path)), *label, *format_.describe(content, path), *_field_rows(fields)]
 
 
 def _checkpoint_rows(path: Path) -> Rows:
@@ -211,7 +230,8 @@ def _field_rows(fields: "Mapping[str, Floats]") -> Rows:
     from minisplat_ref.types import Gaussians
 
     means = fields["means"]
-    rows = [("Gaussians", f"{len(means):,}")]
+    is_of_gaussians = set(Gaussians._fields) <= set(fields)
+    rows = [("Gaussians" if is_of_gaussians else "primitives", f"{len(means):,}")]
     if "sh_rest" in fields and fields["sh_rest"].ndim == 3:
         rows.append(("SH degree", str(math.isqrt(fields["sh_rest"].shape[1] + 1) - 1)))
     rows += _bounds_rows(means)

@@ -62,7 +62,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
-    parser.add_argument("--extension", metavar="E", help="the one that the PLY was trained with (a run knows its own)")
+    parser.add_argument(
+        "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
+    )
     parser.add_argument(
         "--frames", type=integer(1), default=60, metavar="N", help="number of images of an orbit (default 60)"
     )
@@ -189,18 +191,16 @@ def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
 def _open_file(path: Path, args: argparse.Namespace) -> _Source:
     import numpy as np
 
-    from minisplat_ref.extensions.extension import CORE, load_extension
     from minisplat_ref.io.frames import frame_of_means
-    from minisplat_ref.runs.conversion import read_population
+    from minisplat_ref.runs.model_file import read_model
     from minisplat_ref.runs.scoring import Trained
     from minisplat_ref.runs.settings import place_model
     from minisplat_ref.types import Model
 
-    owner = CORE if args.extension is None else load_extension(args.extension)
-    representation = owner.representation
-    model = Model(read_population(path, owner))
-    frame = frame_of_means(model.gaussians.means)
-    trained = Trained(place_model(model, owner, frame), representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
+    read = read_model(path, args.extension)
+    frame = frame_of_means(read.population.means)
+    model = place_model(Model(read.population), read.owner, frame)
+    trained = Trained(model, read.owner.representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
     return _Source(trained, [], path.with_name(f"{path.stem}-views"), frame)
 
 

@@ -350,6 +350,7 @@ def _train(
     room: str,
 ) -> int:
     from minisplat_ref.runs import checkpoints, run_folder
+    from minisplat_ref.runs.model_file import describe_parts, missing_parts
     from minisplat_ref.runs.notices import describe_place, describe_sizes
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
@@ -378,22 +379,13 @@ def _train(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
-    if parts := _parts_beside_ply(state):
+    if parts := missing_parts(state.shared):
         print(
-            f"point_cloud.ply does not hold {' and '.join(parts)}, which other programs therefore leave out;"
+            f"point_cloud.ply does not hold {describe_parts(parts)}, which other programs therefore leave out;"
             f" minisplat-ref render {folder} has all"
         )
     print(f"open {(folder / run_folder.REPORT).resolve()}")
     return _simplify(folder, settings)
-
-
-def _parts_beside_ply(state: "TrainState") -> list[str]:
-    """Return what every view shows of a model and no PLY holds."""
-    from minisplat_ref.training.compensation import COMPENSATION
-    from minisplat_ref.training.sky import SKY
-
-    parts = {SKY: "the sky", COMPENSATION: "the compensation of opacities"}
-    return [part for name, part in parts.items() if name in state.shared]
 
 
 def _simplify(folder: Path, settings: "Settings") -> int:

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -12,8 +13,10 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders, module_of
 from minisplat_ref.io.formats import Format
+from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES
+from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.studies.study import Study
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
@@ -32,8 +35,9 @@ class Extension(NamedTuple):
     """What is trained and how it is drawn."""
     losses: tuple[LossTerm, ...] = ()
     """Terms that join those of any recipe that is trained with the extension; ``--set NAME=WEIGHT`` weighs them."""
-    save: Callable[[str | Path, Any], None] = save_ply
-    """``save(path, population)``; by default further fields become PLY columns that other readers skip."""
+    save: Callable[[str | Path, Any, Label], None] = save_ply
+    """``save(path, population, label)``: a PLY with the comments of a label (:mod:`minisplat_ref.io.label`) in its
+    header; by default further fields become columns that other readers skip."""
     load: Callable[[str | Path, Any], Any] = load_ply
     """``load(path, type)`` of the population's type."""
     commands: tuple[ModuleType, ...] = ()
@@ -47,6 +51,12 @@ class Extension(NamedTuple):
     """Its measured claims: ``minisplat-ref study NAME/...``."""
     formats: tuple[Format, ...] = ()
     """File formats of the six fields of 3DGS, which ``convert`` writes, and every command reads that reads a PLY."""
+
+    @property
+    def label(self) -> Label:
+        """What its files say about how they are drawn: nothing where 3DGS draws them."""
+        is_plain = (self.representation.population, self.representation.renderer) == (Gaussians, SPLATTING)
+        return NO_LABEL if is_plain else Label(self.name)
 
 
 CORE = Extension("core")
@@ -108,11 +118,24 @@ def _check_parts(extension: Extension, name: str, folder: Path) -> None:
             )
     if not isinstance(extension.representation, Representation):
         raise InputError(f"extension {name} in {folder}: representation is not a Representation")
+    if not _takes_three(extension.save):
+        raise InputError(f"extension {name} in {folder}: save does not take a path, a population and a label")
     for recipe in extension.recipes:
         if recipe.name in RECIPES:
             raise InputError(
                 f"extension {name} has a recipe {recipe.name}, and so has the core: rename the extension's"
             )
+
+
+def _takes_three(function: Callable[..., Any]) -> bool:
+    """Return whether a function can be called with three arguments: better found out now than after a training."""
+    try:
+        signature(function).bind(None, None, None)
+    except TypeError:
+        return False
+    except ValueError:  # it does not say
+        return True
+    return True
 
 
 def load_extensions() -> list[Extension]:

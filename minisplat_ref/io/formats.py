@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.label import NO_LABEL, Label, read_sidecar, write_sidecar
 from minisplat_ref.types import Gaussians
 
 
@@ -30,6 +31,11 @@ class Format(NamedTuple):
     """``decode(content, source)`` of a whole file; float32, finite. Raises InputError, which names ``source``."""
     describe: Callable[[bytes, str | Path], list[tuple[str, str]]]
     """``describe(content, source)``: names and values that say what the file stores, and how precisely."""
+    write_label: Callable[[bytes, Label], bytes] | None = None
+    """``write_label(content, label)``: the content with a label in it; None where there is no place for one, so that it
+    goes into a sidecar."""
+    read_label: Callable[[bytes, str | Path], Label] | None = None
+    """``read_label(content, source)``: what ``write_label`` wrote, ``NO_LABEL`` where it did not. Raises InputError."""
 
 
 def read_content(path: str | Path) -> bytes:
@@ -56,3 +62,33 @@ def write_content(path: str | Path, content: bytes) -> None:
     """
     with replacing(path) as temporary:
         temporary.write_bytes(content)
+
+
+def with_label(format_: Format, content: bytes, label: Label) -> bytes:
+    """Return the content of a file with its label, where the format has a place for it and there is one."""
+    return content if label == NO_LABEL or format_.write_label is None else format_.write_label(content, label)
+
+
+def write_file(path: Path, format_: Format, content: bytes, label: Label) -> None:
+    """Write a compact file whose content has its label if it can, and else the label beside it.
+
+    Raises
+    ------
+    InputError
+        As for :func:`write_content`, or another program's file is where the label should be; nothing is written then.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+        if format_.write_label is None:  # first, so that the file is never there without it
+            write_sidecar(path, content, label)
+
+
+def label_of(path: Path, format_: Format, content: bytes) -> Label:
+    """Return the label of a compact file, in it or beside it.
+
+    Raises
+    ------
+    InputError
+        The file or its label is damaged.
+    """
+    return read_sidecar(path, content) if format_.read_label is None else format_.read_label(content, path)

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.label import NO_LABEL, Label, from_comments, to_comments
 from minisplat_ref.io.ply_dialects import as_usual, renamed
-from minisplat_ref.io.ply_file import n_rows_of, property_names, read_vertices, write_vertices
+from minisplat_ref.io.ply_file import comments_of, n_rows_of, property_names, read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
 
@@ -126,7 +127,7 @@ def further_properties(path: str | Path) -> tuple[str, ...]:
     return tuple(name for name in names if name not in usual and not name.startswith("f_rest_"))
 
 
-def save_ply(path: str | Path, gaussians: Any) -> None:
+def save_ply(path: str | Path, gaussians: Any, label: Label = NO_LABEL) -> None:
     """Write trained Gaussians as a PLY in the 3DGS layout: binary, little-endian, float32, with zero normals.
 
     Centres in float64 that float32 would move by much of the Gaussians' size, such as those of a scene in UTM
@@ -139,6 +140,8 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
     gaussians : Gaussians, or a NamedTuple that has its fields and others
         Of any spherical-harmonic degree; N may be 0. A further field of shape [N] becomes a property with its name, one
         of shape [N, k] the properties ``NAME_0``, ``NAME_1``, ...; other readers skip them.
+    label : Label
+        What the header says about how the file is drawn.
 
     Raises
     ------
@@ -164,7 +167,18 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
             dtype = np.float64 if names == MEANS and are_far(gaussians) else np.float32
             columns |= zip(names, (column.astype(dtype, copy=False) for column in values), strict=True)
     check_finite(path, columns)
-    write_vertices(path, columns)
+    write_vertices(path, columns, comments=to_comments(label))
+
+
+def read_label(path: str | Path) -> Label:
+    """Return what a PLY says about how it is drawn.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened, or its header or its label is malformed.
+    """
+    return from_comments(comments_of(path), path)
 
 
 def are_far(gaussians: Any) -> bool:

@@ -74,6 +74,8 @@ class Header(NamedTuple):
     encoding: str
     elements: Sequence[Element]
     """All of them, in the file's order."""
+    comments: Sequence[str] = ()
+    """Without the word ``comment``, with one space between two words."""
 
     @property
     def before(self) -> Sequence[Element]:
@@ -112,6 +114,19 @@ def property_names(path: str | Path) -> tuple[str, ...]:
         return read_header(file, path).vertices.dtype.names or ()
 
 
+def comments_of(path: str | Path) -> Sequence[str]:
+    """Return the comments in the header.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened or its header is malformed.
+    """
+    path = Path(path)
+    with open_ply(path) as file:
+        return read_header(file, path).comments
+
+
 def read_vertices(path: str | Path) -> dict[str, NDArray]:
     """Read every property of the vertices of a PLY file; lists are left out.
 
@@ -138,11 +153,13 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
 
 
-def write_vertices(path: str | Path, columns: Mapping[str, NDArray], faces: NDArray | None = None) -> None:
+def write_vertices(
+    path: str | Path, columns: Mapping[str, NDArray], faces: NDArray | None = None, comments: Sequence[str] = ()
+) -> None:
     """Write columns of equal length P as the vertices of a little-endian PLY, complete or not at all.
 
     Each property has the scalar type of its column: uint8, int32, float32 and so on. Faces [F, c], rows of vertices,
-    have the same number of corners each, at most 255.
+    have the same number of corners each, at most 255. Comments are lines of the header, without the word ``comment``.
     """
     type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
@@ -150,9 +167,10 @@ def write_vertices(path: str | Path, columns: Mapping[str, NDArray], faces: NDAr
     properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
     if faces is not None:
         properties += f"element face {len(faces)}\nproperty list uchar int {CORNERS[0]}\n"
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
+    lines = "".join(f"comment {comment}\n" for comment in comments)
+    header = f"ply\nformat binary_little_endian 1.0\n{lines}element vertex {n}\n{properties}end_header\n"
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(header.encode("ascii"))
+        file.write(header.encode())
         for start in range(0, n, ROWS_AT_ONCE):  # so that they are never all in memory twice
             part = slice(start, start + ROWS_AT_ONCE)
             rows = np.empty(len(range(n)[part]), dtype)
@@ -179,9 +197,10 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
     encoding = ""
     declared: list[tuple[str, int, list[tuple[str, str, str | None]]]] = []  # (name, n, [(name, type, list's count)])
+    comments: list[str] = []
     words: list[str] = []
     while words != ["end_header"]:
-        words = file.readline(HEADER_LINE_MAX).decode("ascii", errors="replace").split()
+        words = file.readline(HEADER_LINE_MAX).decode(errors="replace").split()
         match words:
             case ["end_header"]:
                 pass
@@ -195,7 +214,9 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 declared[-1][2].append((name, kind, None))
             case ["property", "list", count, kind, name] if count in COUNT_TYPES and kind in SCALAR_TYPES and declared:
                 declared[-1][2].append((name, kind, count))
-            case ["comment" | "obj_info", *_]:
+            case ["comment", *text]:
+                comments.append(" ".join(text))
+            case ["obj_info", *_]:
                 pass
             case _:
                 raise InputError(f"{path}: cannot read the header line '{' '.join(words)}'; export the PLY again")
@@ -210,7 +231,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         raise InputError(
             f"{path}: the PLY header lacks its format, vertices or properties, or repeats one; export it again"
         )
-    return Header(encoding, elements)
+    return Header(encoding, elements, comments)
 
 
 def _property(name: str, kind: str, count: str | None, order: str) -> Property:

@@ -4,19 +4,20 @@ What is lost by a compact file is measured on photographs that were *trained* on
 level is a decision like others, and the test views stay out of it.
 """
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, load_extension, owner_of
-from minisplat_ref.io.formats import Format, read_content
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, owner_of
+from minisplat_ref.io.formats import Format, with_label
 from minisplat_ref.io.frames import frame_of_means, place_scene
-from minisplat_ref.io.ply import are_far, further_properties
+from minisplat_ref.io.label import Label
+from minisplat_ref.io.ply import are_far
 from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.runs.model_file import label_for, missing_parts, read_model
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
 from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, number_views
@@ -36,6 +37,13 @@ class Source(NamedTuple):
     """In a few words."""
     frame: Frame = FILE_FRAME
     """The frame in which it is rendered."""
+    lacks: tuple[str, ...] = ()
+    """Names of the shared parameters that a file lacks of its run."""
+
+    @property
+    def label(self) -> Label:
+        """What a file of its population says about how it is drawn."""
+        return label_for(self.owner, missing_parts((*self.model.shared, *self.lacks)))
 
 
 class Choice(NamedTuple):
@@ -47,30 +55,6 @@ class Choice(NamedTuple):
     """dB of PSNR that are lost; None where it was not measured."""
 
 
-def read_population(path: Path, owner: Extension) -> Any:
-    """Read the population of a PLY or of a compact file.
-
-    Parameters
-    ----------
-    path : Path
-        What has a suffix that no extension knows is read as a PLY.
-    owner : Extension
-        Whose population it is, for a PLY; ``CORE`` for the six fields.
-
-    Raises
-    ------
-    InputError
-        The file is damaged or missing, or does not hold what the extension needs.
-    """
-    format_ = find_format(path)
-    if format_ is None:
-        return owner.load(path, owner.representation.population)
-    if owner.representation.population is not Gaussians:
-        fields = ", ".join(set(owner.representation.population._fields) - set(Gaussians._fields))
-        raise InputError(f"{path}: {format_.suffix} does not hold {fields} of extension {owner.name}: give a PLY")
-    return format_.decode(read_content(path), path)
-
-
 def open_source(path: Path, extension: str | None = None) -> Source:
     """Read a model from a run folder, a checkpoint, a PLY or a compact file.
 
@@ -78,7 +62,7 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     ----------
     path : Path
     extension : str, optional
-        That a PLY was trained with; runs and checkpoints know theirs.
+        That draws a file, in place of what it says; runs and checkpoints know theirs.
 
     Raises
     ------
@@ -92,12 +76,8 @@ def open_source(path: Path, extension: str | None = None) -> Source:
         return _of_checkpoint(path) if is_checkpoint else _of_run(path)
     if not path.exists():
         raise InputError(f"{path} does not exist: give a run folder, a checkpoint, a PLY or a compact file")
-    owner = CORE if extension is None else load_extension(extension)
-    model = Model(read_population(path, owner))
-    if owner is CORE and find_format(path) is None and (further := further_properties(path)):
-        message = f"{path} also has {', '.join(further)}, which are left out: --extension E says what they belong to"
-        warnings.warn(one_line(message), InputWarning, stacklevel=2)
-    return Source(model, owner, path.name, frame_of_means(model.gaussians.means))
+    read = read_model(path, extension)
+    return Source(Model(read.population), read.owner, path.name, frame_of_means(read.population.means), read.lacks)
 
 
 def _of_run(folder: Path) -> Source:
@@ -156,8 +136,8 @@ def check_population(population: Any, format_: Format, what: str) -> None:
         )
 
 
-def encode_as(format_: Format, path: Path, gaussians: Gaussians, level: int) -> bytes:
-    """Return the content of a file at one level; an error names the file.
+def encode_as(format_: Format, path: Path, label: Label, gaussians: Gaussians, level: int) -> bytes:
+    """Return the content of a file at one level, with its label if it has a place for it; an error names the file.
 
     Raises
     ------
@@ -171,7 +151,7 @@ def encode_as(format_: Format, path: Path, gaussians: Gaussians, level: int) -> 
             f" {np.spacing(np.float32(distance)):.2g}; write a PLY, which holds them in float64"
         )
     try:
-        return format_.encode(gaussians, level)
+        return with_label(format_, format_.encode(gaussians, level), label)
     except InputError as error:
         raise InputError(f"{path} cannot be written: {error}") from None
 

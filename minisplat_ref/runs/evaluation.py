@@ -12,8 +12,8 @@ from minisplat_ref.extensions.extension import CORE, owner_of
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.checkpoints import Saved, newest_model
-from minisplat_ref.runs.conversion import read_population
 from minisplat_ref.runs.first_use import warn_if_not_kept
+from minisplat_ref.runs.model_file import choose_owner, label_of, read_population
 from minisplat_ref.runs.notices import warn_of_model
 from minisplat_ref.runs.scoring import score, to_metrics
 from minisplat_ref.runs.settings import Settings, load, load_frame, load_lpips, load_photographs, place_model
@@ -69,6 +69,7 @@ def evaluate_run(
     saved, frame = newest_model(folder, settings), load_frame(folder)
     if model is not None:
         owner = owner_of(settings.recipe, settings.extension) or CORE
+        choose_owner(model, label_of(model), owner, f"run {folder}")
         given = place_model(Model(read_population(model, owner)), owner, frame)
         saved = Saved(saved.model._replace(gaussians=given.gaussians), None)
     warn_of_model(saved.model, folder)

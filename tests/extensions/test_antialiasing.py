@@ -30,6 +30,7 @@ from minisplat_ref.extensions.antialiasing.method import (
     with_3d_filter,
 )
 from minisplat_ref.extensions.antialiasing.reference import smooth, smooth_vjp
+from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms import sampling
 from minisplat_ref.mechanisms.sampling import sampling_intervals, shrink_photographs
 from minisplat_ref.methods.gaussian_splatting import clone_and_split
@@ -278,7 +279,7 @@ def run_folder(scene_folder, tmp_path_factory):
 def test_training_measures_filters_and_the_ply_keeps_them(run_folder, tmp_path, capsys):
     gaussians = load_ply(run_folder / "point_cloud.ply", FilteredGaussians)
     assert (gaussians.filter_sigmas > 0).all()
-    save_ply(tmp_path / "again.ply", gaussians)
+    save_ply(tmp_path / "again.ply", gaussians, Label("antialiasing"))
     assert (tmp_path / "again.ply").read_bytes() == (run_folder / "point_cloud.ply").read_bytes()
     assert main(["info", str(run_folder / "point_cloud.ply")]) == 0
     assert "filter_sigmas" in capsys.readouterr().out
@@ -302,7 +303,7 @@ def test_interrupted_then_resumed_gives_the_same_bytes(scene_folder, run_folder,
 
 def test_a_ply_is_drawn_with_its_filters_and_one_without_is_refused(run_folder, tmp_path, capsys):
     ply, options = str(run_folder / "point_cloud.ply"), ["--cameras", str(run_folder / "cameras.json")]
-    for name, extension in (("ours", ["--extension", "antialiasing"]), ("theirs", [])):
+    for name, extension in (("ours", []), ("theirs", ["--extension", "core"])):
         assert main(["render", ply, *options, *extension, "--out", str(tmp_path / name)]) == 0
     images = [{p.name: p.read_bytes() for p in (tmp_path / name).glob("*.png")} for name in ("ours", "theirs")]
     assert images[0].keys() == images[1].keys() and images[0] != images[1]
@@ -334,9 +335,15 @@ def test_the_study_measures_all_recipes(tmp_path, capsys):
     result = json.loads((out / "result.json").read_text())
     assert result["zooms"] == [0.25, 0.5, 1.0, 2.0]
     psnr = {name: seeds[0] for name, seeds in result["psnr"].items()}
-    assert list(psnr) == ["3dgs-accel", "3D filter alone", "2D filter alone", "antialiasing", "analytic"]
+    assert [name for name in psnr if "," not in name] == [
+        "3dgs-accel",
+        "3D filter alone",
+        "2D filter alone",
+        "antialiasing",
+        "analytic",
+    ]
     assert psnr["antialiasing"][0] > psnr["3dgs-accel"][0]  # from far
-    assert len({tuple(values) for values in psnr.values()}) == 5
+    assert len({tuple(values) for values in psnr.values()}) == len(psnr) == 8
     assert (out / "figure.png").stat().st_size > 10_000 and "| analytic " in capsys.readouterr().out
     assert main(["study", "antialiasing/zoom", "nowhere", "--out", str(tmp_path / "none")]) == 2
     assert "neither a folder nor one of" in capsys.readouterr().err and not (tmp_path / "none").exists()

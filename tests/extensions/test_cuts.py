@@ -178,7 +178,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
     assert population.curves.shape == (len(population.means), 8) and (population.widths == 0).all()
     assert main(["eval", str(run)]) == 0
     ply, cameras = str(run / "point_cloud.ply"), ["--cameras", str(run / "cameras.json")]
-    for name, extension in (("ours", ["--extension", "cuts"]), ("theirs", [])):
+    for name, extension in (("ours", []), ("theirs", ["--extension", "core"])):
         assert main(["render", ply, *cameras, *extension, "--out", str(tmp_path / name)]) == 0
     ours, theirs = (sorted((tmp_path / name).glob("*.png")) for name in ("ours", "theirs"))
     assert all(a.read_bytes() != b.read_bytes() for a, b in zip(ours, theirs, strict=True))

@@ -360,8 +360,8 @@ def test_a_scene_is_refitted_drawn_and_exported(scene_folder, tmp_path, capsys):
     assert after > before + 0.2
     assert main([*tune[:4], str(again), *tune[5:]]) == 0 and again.read_bytes() == fans.read_bytes()
     cameras = ["--cameras", str(run / "cameras.json")]
-    assert main(["render", str(fans), "--extension", "fans", *cameras, "--out", str(tmp_path / "images")]) == 0
-    command = ["render", str(fans), "--extension", "fans", *cameras, "--depth", "--out", str(tmp_path / "depths")]
+    assert main(["render", str(fans), *cameras, "--out", str(tmp_path / "images")]) == 0
+    command = ["render", str(fans), *cameras, "--depth", "--out", str(tmp_path / "depths")]
     assert main(command) == 2 and not (tmp_path / "depths").exists()
     assert len(list((tmp_path / "images").glob("*.png"))) == 8
     capsys.readouterr()

@@ -338,7 +338,7 @@ def test_levels_are_built_of_a_trained_scene_and_drawn(scene_folder, tmp_path, c
     assert_array_equal(levels.means[:n], plain.means)
     sizes = [["--size", size, "--frames", "1"] for size in ("128x96", "16x12")]
     for i, size in enumerate(sizes):
-        for name, extension in (("ours", ["--extension", "multi-scale"]), ("theirs", [])):
+        for name, extension in (("ours", []), ("theirs", ["--extension", "core"])):
             assert main(["render", str(out), *size, *extension, "--out", str(tmp_path / f"{name}{i}")]) == 0
     assert main(["multi-scale", "build", str(out), "--out", str(tmp_path / "twice.ply")]) == 2
     assert "has levels already" in capsys.readouterr().err and not (tmp_path / "twice.ply").exists()

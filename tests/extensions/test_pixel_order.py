@@ -399,10 +399,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
     config = json.loads((run / "config.json").read_text())
     assert '"buffer_size": 8' in json.dumps(config)
     assert main(["eval", str(run)]) == 0
-    assert (
-        main(["render", str(run / "point_cloud.ply"), "--extension", "pixel-order", "--frames", "1", "--size", "24x18"])
-        == 0
-    )
+    assert main(["render", str(run / "point_cloud.ply"), "--frames", "1", "--size", "24x18"]) == 0
     capsys.readouterr()
     for text, message in (("0", "buffer_size is 0: give 1"), ("many", "buffer_size")):
         bad = tmp_path / "bad"

@@ -346,7 +346,7 @@ def test_trains_evaluates_and_renders(room, tmp_path):
     assert losses[-1] < losses[0]
     assert main(["eval", str(run)]) == 0
     ply, cameras = str(run / "point_cloud.ply"), ["--cameras", str(run / "cameras.json")]
-    assert main(["render", ply, *cameras, "--extension", "polygons", "--depth", "--out", str(tmp_path / "out")]) == 0
+    assert main(["render", ply, *cameras, "--depth", "--out", str(tmp_path / "out")]) == 0
     assert len(sorted((tmp_path / "out").glob("*.png"))) == 16
 
 

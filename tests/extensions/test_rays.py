@@ -369,7 +369,7 @@ def test_trains_evaluates_and_renders(run_folder, tmp_path):
     assert losses[-1] < losses[0]
     assert main(["eval", str(run_folder)]) == 0
     ply, cameras = str(run_folder / "point_cloud.ply"), ["--cameras", str(run_folder / "cameras.json")]
-    for name, extension in (("ours", ["--extension", "rays"]), ("theirs", [])):
+    for name, extension in (("ours", []), ("theirs", ["--extension", "core"])):
         assert main(["render", ply, *cameras, *extension, "--depth", "--out", str(tmp_path / name)]) == 0
     ours, theirs = (sorted((tmp_path / name).glob("*.png")) for name in ("ours", "theirs"))
     assert len(ours) == 16 and all(a.read_bytes() != b.read_bytes() for a, b in zip(ours, theirs, strict=True))

@@ -15,6 +15,7 @@ from minisplat_ref.extensions import extension as extension_module
 from minisplat_ref.extensions.compression import levels, msz, spz
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
 from minisplat_ref.io.formats import Format
+from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.runs import conversion
 from minisplat_ref.training.calibration import EXPOSURES
@@ -176,7 +177,8 @@ def test_further_fields_need_a_ply(run, tmp_path, one_line, capfd):
     line = one_line("convert", tmp_path / "moving.ply", tmp_path / "a.msz", "--extension", "velocity")
     assert "velocities, which .msz does not hold: convert it to a PLY" in line
     convert(tmp_path / "moving.ply", tmp_path / "b.ply", "--extension", "velocity")
-    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "moving.ply").read_bytes()
+    save_ply(tmp_path / "labelled.ply", moving, Label("velocity"))
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "labelled.ply").read_bytes()
     convert(tmp_path / "moving.ply", tmp_path / "c.msz")
     assert "also has velocities_0, velocities_1, velocities_2, which are left out" in capfd.readouterr().err
     line = one_line("render", tmp_path / "c.msz", "--extension", "velocity", "--out", tmp_path / "views")

@@ -19,11 +19,16 @@ Gaussian has its parent's filter until it is measured. A recipe of the core that
 ``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a Gaussian
 over a pixel, is the extension ``analytic``; ``docs/FAMILY.md`` has the figures of both.
 
-    minisplat-ref train SCENE --recipe antialiasing
+A viewer of 3DGS knows neither filter. ``fuse`` (:mod:`minisplat_ref.extensions.antialiasing.fuse`) writes s' and o' in
+the place of s and o, a PLY of six fields.
+
+    minisplat-ref train SCENE --recipe antialiasing --out runs/fine
+    minisplat-ref antialiasing fuse runs/fine fine.ply
     minisplat-ref study antialiasing/zoom SCENE --out DIR
     minisplat-ref oracle gradients --extension antialiasing
 """
 
+from minisplat_ref.extensions.antialiasing import fuse
 from minisplat_ref.extensions.antialiasing.method import ANTIALIASING, FILTERED
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.studies.study import OUT, declare, downscale, iterations, scene, seeds
@@ -34,4 +39,6 @@ ZOOM = declare(
     f"{__name__}.zoom.run",
     *(scene("room"), OUT, downscale(4), iterations(1000), seeds(2)),
 )
-EXTENSION = Extension("antialiasing", recipes=(ANTIALIASING,), representation=FILTERED, studies=(ZOOM,))
+EXTENSION = Extension(
+    "antialiasing", recipes=(ANTIALIASING,), representation=FILTERED, commands=(fuse,), studies=(ZOOM,)
+)

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.extensions.antialiasing.method import with_2d_filter, with_3d_filter
+from minisplat_ref.extensions.antialiasing.method import apply_filters, with_2d_filter, with_3d_filter
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.mechanisms.sampling import block_means, shrink_photographs, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
@@ -21,12 +21,14 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_band, show, with_deviation
+from minisplat_ref.training.compensation import compensation, with_compensation
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.types import Floats, Model, Scene, View, view_from
+from minisplat_ref.types import Floats, Gaussians, Model, Scene, View, view_from
 
 IN_SPACE, IN_IMAGE = "3D filter alone", "2D filter alone"
 COLORS = {"3dgs-accel": GREY, IN_SPACE: OCHRE, IN_IMAGE: GREEN, "antialiasing": RED, "analytic": BLUE}
+FUSED = "antialiasing, fused"
 FARTHEST = 8  # times smaller than the training views
 SIZE_MIN = 4  # pixels per side of the smallest image that is measured
 
@@ -64,6 +66,19 @@ def train_arm(arm: str, scene: Scene, iterations: int, seed: int) -> Trained:
     return Trained(state.model, recipe.renderer, scene.background)
 
 
+def in_viewers(trained: Trained) -> dict[str, Trained]:
+    """Return what viewers of 3DGS show of the recipe ``antialiasing``: without its filters, and after ``fuse``."""
+    filtered = trained.model.gaussians
+    gaussians = Gaussians(*(getattr(filtered, name) for name in Gaussians._fields))
+    fused = trained._replace(model=Model(apply_filters(filtered)), renderer=SPLATTING)
+    antialiased = fused.model._replace(shared=compensation(0))
+    return {
+        "antialiasing, filters left out": fused._replace(model=Model(gaussians)),
+        FUSED: fused,
+        f"{FUSED}, viewer antialiased": fused._replace(model=antialiased, renderer=with_compensation(SPLATTING)),
+    }
+
+
 def blocks(scene: Scene, downscale: int) -> list[int]:
     """Return the sides n of the blocks that are compared, the largest first: from 8 D to 1 in factors of two."""
     camera = scene.test_views[0].camera
@@ -89,7 +104,7 @@ class Measured(NamedTuple):
     zooms: list[float]
     """Pixels per side, relative to the training views."""
     psnr: dict[str, list[list[float]]]
-    """dB by recipe, then seed, then zoom."""
+    """dB by recipe, and by viewer of ``antialiasing``, then seed, then zoom."""
     counts: dict[str, list[int]]
     """Number of Gaussians by recipe, then seed."""
     images: dict[str, Floats]
@@ -99,14 +114,16 @@ class Measured(NamedTuple):
 def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measured:
     """Train the scene with every recipe and seed, and measure."""
     small, sides = shrink_photographs(scene, downscale), blocks(scene, downscale)
-    psnr: dict[str, list[list[float]]] = {name: [] for name in COLORS}
+    psnr: dict[str, list[list[float]]] = {}
     counts: dict[str, list[int]] = {name: [] for name in COLORS}
     view = scene.test_views[0]
     images = {"photograph": _photograph(view, sides[-1])}
     for seed in range(seeds):
         for name in kit.with_progress(COLORS, f"trainings, seed {seed}"):
             found = train_arm(name, small, iterations, seed)
-            psnr[name].append(psnrs(found, scene, sides))
+            shown = {name: found, **(in_viewers(found) if name == "antialiasing" else {})}
+            for how, trained in shown.items():
+                psnr.setdefault(how, []).append(psnrs(trained, scene, sides))
             counts[name].append(len(found.model.gaussians.means))
             images.setdefault(name, np.clip(found.render_at(view, 1 / sides[-1]), 0, 1))
     return Measured([downscale / n for n in sides], psnr, counts, images)
@@ -116,14 +133,10 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train and measure."""
     scene = kit.read_scene(args.scene)
     found = measure(scene, args.downscale, args.iterations, args.seeds)
-    rows = [
-        [
-            name,
-            f"{np.mean(found.counts[name]):,.0f}",
-            *(with_deviation(values, 2) for values in zip(*runs, strict=True)),
-        ]
-        for name, runs in found.psnr.items()
-    ]
+    rows = []
+    for name, runs in found.psnr.items():
+        count = np.mean(found.counts[name.partition(",")[0]])
+        rows.append([name, f"{count:,.0f}", *(with_deviation(values, 2) for values in zip(*runs, strict=True))])
     table = markdown_table(["recipe", "Gaussians", *(f"x {zoom:g}" for zoom in found.zooms)], rows)
     result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
     result |= {"zooms": found.zooms, "psnr": found.psnr, "counts": found.counts}
@@ -138,6 +151,7 @@ def draw(found: Measured) -> Figure:
     axes = left.subplots()
     for name, color in COLORS.items():
         plot_band(axes, found.zooms, np.array(found.psnr[name]), color, name)
+    axes.plot(found.zooms, np.mean(found.psnr[FUSED], axis=0), "--", color=COLORS["antialiasing"], label=FUSED)
     axes.set_xscale("log", base=2)
     axes.set_xticks(found.zooms, [f"{zoom:g}" if zoom >= 1 else f"1/{1 / zoom:g}" for zoom in found.zooms])
     axes.set(title="PSNR of test views (dB)", xlabel="pixels per side, relative to the training views")

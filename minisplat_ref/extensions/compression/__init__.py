@@ -19,7 +19,9 @@ are stored together, and zstandard packs them. There are 13 levels; level 0 keep
     minisplat-ref study compression/rate-distortion SCENE --out DIR
 
 The order of the Gaussians is not preserved; only ties in depth depend on it. Quaternions come back with another length,
-which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY.
+which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that draws
+these six in its own way is recorded, by ``.msz`` in its header, by ``.spz`` in a file beside it
+(:mod:`minisplat_ref.io.label`).
 
 Left out are pruning, merging and training with the quantiser in the loop, which gain more than any entropy coder;
 vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.md`` has the measured figures.

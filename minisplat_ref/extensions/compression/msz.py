@@ -13,6 +13,7 @@ byte for byte: the order, too, depends on lattice points alone, and Gaussians of
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,17 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression import lattice, levels
 from minisplat_ref.extensions.compression.levels import Exponents
 from minisplat_ref.io.formats import Format
-from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
+from minisplat_ref.mechanisms.packing.container import (
+    WAY_OUT,
+    Container,
+    Packed,
+    is_count,
+    pack,
+    parse,
+    read_label,
+    unpack,
+    write_label,
+)
 from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
@@ -215,5 +226,7 @@ MSZ = Format(
     encode=encode,
     decode=decode,
     describe=describe,
+    write_label=partial(write_label, CONTAINER),
+    read_label=partial(read_label, CONTAINER),
 )
 """The format of this project."""

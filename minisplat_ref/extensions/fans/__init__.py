@@ -12,7 +12,7 @@ gradients, so that the position, colour and opacity of each vertex can be traine
 
     minisplat-ref fans export runs/fox fox.glb
     minisplat-ref fans fine-tune photos/fox runs/fox fans.ply
-    minisplat-ref render fans.ply --extension fans --cameras runs/fox/cameras.json
+    minisplat-ref render fans.ply --cameras runs/fox/cameras.json
     minisplat-ref train SCENE --recipe fans --set is_flat=false
     minisplat-ref study fans/profile --out DIR
     minisplat-ref study fans/refit SCENE --out DIR

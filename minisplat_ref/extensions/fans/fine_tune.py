@@ -11,7 +11,7 @@ from minisplat_ref.studies.study import downscale, iterations, seed
 EPILOG = """\
 example:
   minisplat-ref fans fine-tune photos/fox runs/fox fans.ply --downscale 4
-  minisplat-ref render fans.ply --extension fans --cameras runs/fox/cameras.json
+  minisplat-ref render fans.ply --cameras runs/fox/cameras.json
   minisplat-ref fans export fans.ply fox.glb"""
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.shapes import SOLID_PLANES, Fans, FanShape, mesh_of
 from minisplat_ref.io.formats import write_content
+from minisplat_ref.io.label import Label, to_comments
 from minisplat_ref.io.ply import COLORS, MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import property_names, read_vertices, write_vertices
@@ -28,6 +29,7 @@ from minisplat_ref.types import Floats
 SUFFIXES = (".ply", ".glb", ".obj")
 BYTES = (*COLORS, "alpha")
 FLOATS = ("rgba_0", "rgba_1", "rgba_2", "rgba_3")
+LABEL = Label("fans")
 
 
 def check_suffix(path: Path) -> None:
@@ -85,8 +87,8 @@ def _trimesh() -> Any:
     return trimesh
 
 
-def save_fans(path: str | Path, fans: Fans) -> None:
-    """Write a population of fans as a PLY in float32, complete or not at all.
+def save_fans(path: str | Path, fans: Fans, label: Label = LABEL) -> None:
+    """Write a population of fans as a PLY in float32, complete or not at all; its label says what draws it.
 
     Raises
     ------
@@ -98,7 +100,7 @@ def save_fans(path: str | Path, fans: Fans) -> None:
         columns = _columns(mesh.vertices, to_bytes(mesh.rgba))
         columns |= zip(FLOATS, mesh.rgba.astype(np.float32).T, strict=True)
     check_finite(path, columns)
-    write_vertices(path, columns, mesh.faces)
+    write_vertices(path, columns, mesh.faces, to_comments(label))
 
 
 def is_fans(path: str | Path) -> bool:

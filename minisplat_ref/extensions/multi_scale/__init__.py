@@ -26,7 +26,7 @@ not.
 
     minisplat-ref train SCENE --recipe multi-scale
     minisplat-ref multi-scale build runs/SCENE/point_cloud.ply --out levels.ply
-    minisplat-ref render levels.ply --extension multi-scale
+    minisplat-ref render levels.ply
     minisplat-ref study multi-scale/downscale SCENE --out DIR
 """
 

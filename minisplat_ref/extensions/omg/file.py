@@ -16,6 +16,7 @@ harmonics, which are a matrix product.
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +27,17 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
 from minisplat_ref.extensions.omg.svq import Quantised, quantise
 from minisplat_ref.io.formats import Format
-from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
+from minisplat_ref.mechanisms.packing.container import (
+    WAY_OUT,
+    Container,
+    Packed,
+    is_count,
+    pack,
+    parse,
+    read_label,
+    unpack,
+    write_label,
+)
 from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
@@ -273,5 +284,7 @@ OMG_FILE = Format(
     encode=encode,
     decode=decode,
     describe=describe,
+    write_label=partial(write_label, CONTAINER),
+    read_label=partial(read_label, CONTAINER),
 )
 """The format ``.omg``."""

@@ -6,12 +6,12 @@ from typing import Any
 
 from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, soup_of
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.mechanisms.editing.model_file import load_model
+from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 
 EPILOG = """\
 example: move vertices of soup.ply in a mesh tool, then
   minisplat-ref polygons edit runs/fox soup.ply --out edited.ply
-  minisplat-ref render edited.ply --extension polygons --cameras orbit"""
+  minisplat-ref render edited.ply --cameras orbit"""
 
 
 def add_parser(commands: Any) -> None:
@@ -35,6 +35,6 @@ def run(args: argparse.Namespace) -> int:
     n_polygons = len(soup_of(gaussians, 3).rows)
     corners = load_corners(args.soup, n_polygons)
     edited, n_edited = carry_gaussians(gaussians, soup_of(gaussians, corners.shape[1]), corners, args.soup)
-    save_ply(args.out, edited)
+    save_ply(args.out, edited, load_label(args.model))
     print(f"{n_edited:,} of {len(gaussians.means):,} Gaussians follow their polygons, in {args.out}")
     return 0

@@ -18,7 +18,7 @@ from minisplat_ref.extensions.proxies.affine import (
 )
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.mechanisms.editing.model_file import load_model
+from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
 from minisplat_ref.types import Bools, Floats
 
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     check_selected(is_selected, args.model)
     pivot = means[is_selected].mean(axis=0) if args.about is None else np.array(args.about)
     affine: Affine = about_point(linear, pivot, np.array(args.translate or (0.0, 0.0, 0.0)))
-    save_ply(args.out, edit_gaussians(gaussians, affine, is_selected))
+    save_ply(args.out, edit_gaussians(gaussians, affine, is_selected), load_label(args.model))
     print(f"{is_selected.sum():,} of {len(means):,} Gaussians edited, in {args.out}")
     return 0
 

@@ -25,7 +25,7 @@ from minisplat_ref.io import orbits, viewpoints
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.mechanisms.editing.model_file import load_model
+from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, load_mesh, save_mesh
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Camera, Floats
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     _check(args)
-    gaussians, mesh = load_model(args.model), load_mesh(args.mesh)
+    gaussians, mesh, label = load_model(args.model), load_mesh(args.mesh), load_label(args.model)
     setting = Setting(np.array(args.gravity), _select_pinned(args, mesh), args.stretch, args.drag, args.floor)
     camera = _camera(args.cameras, gaussians.means)
     sheet = sheet_of(mesh, setting)
@@ -140,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
             now = Mesh(state.positions, mesh.faces)
             check_mesh(now, f"frame {frame}, folded flat: give a smaller --stretch or more --drag")
             moved = rebuild(now, binding)
-            save_ply(folder / f"frame_{frame:03d}.ply", moved)
+            save_ply(folder / f"frame_{frame:03d}.ply", moved, label)
             write_image(folder / f"frame_{frame:03d}.png", render(moved, camera)[0].image)
             at = energies(state, sheet)
             records.append({"time": frame * n_steps * step, **at._asdict(), "total": at.total})

@@ -7,7 +7,7 @@ from typing import Any
 
 from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.mechanisms.editing.model_file import load_model
+from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import check_same_faces, load_mesh
 
 DESCRIPTION = """\
@@ -57,6 +57,6 @@ def run(args: argparse.Namespace) -> int:
     bar = partial(tqdm, desc="nearest triangles", leave=False, disable=None)
     binding = bind(gaussians, rest, args.reach, bar)
     check_bound(binding, args.reach, args.model)
-    save_ply(args.out, rebuild(deformed, binding))
+    save_ply(args.out, rebuild(deformed, binding), load_label(args.model))
     print(f"{binding.n_bound:,} of {len(gaussians.means):,} Gaussians follow the mesh, in {args.out}")
     return 0

@@ -14,8 +14,9 @@ from minisplat_ref.extensions.rays.lights import World, shade
 from minisplat_ref.extensions.rays.method import tracer_for, whiten_model
 from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.names import file_names
-from minisplat_ref.io.ply import load_ply
+from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.types import Floats, Model
 
@@ -75,7 +76,9 @@ def run(args: argparse.Namespace) -> int:
     if not ((background >= 0) & (background <= 1)).all():
         raise InputError(f"--background is {' '.join(f'{x:g}' for x in background)}: give three numbers from 0 to 1")
     around = surroundings.read(args.scene)
-    gaussians = load_ply(args.model / "point_cloud.ply" if args.model.is_dir() else args.model)
+    file = args.model / "point_cloud.ply" if args.model.is_dir() else args.model
+    gaussians = load_ply(file)
+    warn_of_another(file, read_label(file), "rays", "rays render")
     whitened = whiten_model(Model(gaussians))
     surroundings.check_lights(around, whitened, args.scene)
     views = _views(args, gaussians.means)

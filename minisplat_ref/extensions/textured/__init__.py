@@ -13,7 +13,7 @@ textures of degree 0 the method is 3DGS, to the last byte.
 
     minisplat-ref train SCENE --recipe mini-splatting --out runs/few
     minisplat-ref textured fine-tune SCENE runs/few/point_cloud.ply --out textured.ply
-    minisplat-ref render textured.ply --extension textured --cameras runs/few/cameras.json
+    minisplat-ref render textured.ply --cameras runs/few/cameras.json
     minisplat-ref study textured/counts SCENE --out DIR
     minisplat-ref study textured/limb
     minisplat-ref oracle gradients --extension textured

@@ -6,6 +6,7 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.textured.population import DEGREE
+from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.studies.study import downscale, iterations, seed
 
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             start, scene, args.iterations, args.seed, is_frozen=args.frozen, on_step=lambda _: bar.update()
         )
     after = measure(textured, scene, scene.test_views)
-    save_ply(args.out, textured)
+    save_ply(args.out, textured, Label("textured"))
     print(
         f"{len(gaussians.means):,} Gaussians, {floats_of(gaussians)} numbers each: test PSNR {before.psnr:.2f} dB,"
         f" SSIM {before.ssim:.4f}\nwith textures, {floats_of(textured)} numbers each: {after.psnr:.2f} dB,"

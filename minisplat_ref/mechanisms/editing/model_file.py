@@ -4,7 +4,8 @@ import warnings
 from pathlib import Path
 
 from minisplat_ref.errors import InputWarning, one_line
-from minisplat_ref.io.ply import further_properties, load_ply
+from minisplat_ref.io.label import Label
+from minisplat_ref.io.ply import further_properties, load_ply, read_label
 from minisplat_ref.types import Gaussians
 
 
@@ -21,10 +22,29 @@ def load_model(path: Path) -> Gaussians:
     InputError
         There is no PLY of Gaussians.
     """
-    file = path / "point_cloud.ply" if path.is_dir() else path
+    file = _file(path)
     gaussians: Gaussians = load_ply(file)
     further = further_properties(file)
     if further:
         message = f"{file}: {', '.join(further)} are left out: only the fields of 3DGS are known to move"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
     return gaussians
+
+
+def load_label(path: Path) -> Label:
+    """Return what an edited model is to say about how it is drawn: what the model of :func:`load_model` says.
+
+    An extension whose fields are left out draws it no longer.
+
+    Raises
+    ------
+    InputError
+        The label cannot be read.
+    """
+    file = _file(path)
+    label = read_label(file)
+    return label._replace(extension=None) if further_properties(file) else label
+
+
+def _file(path: Path) -> Path:
+    return path / "point_cloud.ply" if path.is_dir() else path

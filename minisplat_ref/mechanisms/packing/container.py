@@ -21,12 +21,14 @@ from typing import Any, NamedTuple
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.json_file import parse_json
+from minisplat_ref.io.label import Label, from_json, to_json
 
 # Parameters of zstandard. Bytes of quantised numbers hardly repeat, so entropy coding does most of the packing. The
 # strongest parser with a short search is ten times as fast as level 19, and its files are 0.3 to 4 % larger.
 PARAMETERS = {"window_log": 17, "hash_log": 15, "chain_log": 16, "search_log": 3}
 LEVEL = 19  # the source of all other parameters
 HEADER_MAX = 1 << 16  # bytes
+LABEL = "label"  # the entry of a header that says how the file is drawn
 RATIO_MAX = 1 << 15  # bytes made of one packed byte: 2^17 of 4
 UNKNOWN_SIZE = -1  # of a frame that was written as a stream
 WAY_OUT = "copy or export the file again"
@@ -132,6 +134,25 @@ def parse(container: Container, content: bytes, source: str | Path) -> Packed:
         frames[name] = content[begin : begin + size]
         begin += size
     return Packed(header, frames, source)
+
+
+def write_label(container: Container, content: bytes, label: Label) -> bytes:
+    """Return the content of a file with a label in its header."""
+    packed = parse(container, content, _name(container))
+    header = json.dumps({**packed.header, LABEL: to_json(label)}, separators=(",", ":")).encode()
+    assert len(header) <= HEADER_MAX
+    return b"".join([_PREFIX.pack(container.magic, container.version, len(header)), header, *packed.frames.values()])
+
+
+def read_label(container: Container, content: bytes, source: str | Path) -> Label:
+    """Return the label in the header of a file.
+
+    Raises
+    ------
+    InputError
+        As for :func:`parse`, or it is damaged.
+    """
+    return from_json(parse(container, content, source).header.get(LABEL), source)
 
 
 def _is_size(entry: Any) -> bool:

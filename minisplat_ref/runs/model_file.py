@@ -1,0 +1,157 @@
+"""A model's file: who draws it, as its label says, and what it lacks of its run."""
+
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.extensions import VARIABLE, folders
+from minisplat_ref.extensions.extension import CORE, Extension, find_format, load_extension
+from minisplat_ref.io import formats
+from minisplat_ref.io.label import Label, warn_of_another
+from minisplat_ref.io.ply import further_properties, read_label
+from minisplat_ref.training.compensation import COMPENSATION
+from minisplat_ref.training.sky import SKY
+from minisplat_ref.types import Gaussians
+
+PARTS = {SKY: "the sky", COMPENSATION: "the compensation of opacities"}
+"""What every view shows of a model and no file of Gaussians holds, by the names of its shared parameters."""
+
+
+class ModelFile(NamedTuple):
+    """A file, read."""
+
+    population: Any
+    owner: Extension
+    """Whose population it is, and who draws it."""
+    lacks: tuple[str, ...] = ()
+    """Names of shared parameters that its run is drawn with, and that the file does not hold."""
+
+
+def missing_parts(shared: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the shared parameters of a model that its file lacks and every view shows."""
+    return tuple(name for name in PARTS if name in shared)
+
+
+def describe_parts(names: Iterable[str]) -> str:
+    """Return parts of a model in a few words; those that only another version knows by their names."""
+    return " and ".join(PARTS.get(name, name) for name in names)
+
+
+def label_for(owner: Extension, lacks: Iterable[str] = ()) -> Label:
+    """Return what a file is to say that holds a population of an extension, without these parts of its run."""
+    return owner.label._replace(lacks=tuple(lacks))
+
+
+def label_of(path: Path) -> Label:
+    """Return what a PLY or a compact file says about how it is drawn.
+
+    Raises
+    ------
+    InputError
+        The file, or what it says, cannot be read.
+    """
+    format_ = find_format(path)
+    return read_label(path) if format_ is None else formats.label_of(path, format_, formats.read_content(path))
+
+
+def recorded_owner(path: Path, label: Label) -> Extension:
+    """Return the extension that a file says it is drawn by; ``CORE`` if it says nothing.
+
+    Raises
+    ------
+    InputError
+        It is not installed, or cannot be loaded.
+    """
+    if label.extension is None:
+        return CORE
+    if label.extension not in folders():
+        raise InputError(
+            f"{path} is drawn by extension {label.extension}, which is not installed: let {VARIABLE} name the folder"
+            f" that it is in; render and convert take --extension {CORE.name} for what 3DGS knows of it"
+        )
+    return load_extension(label.extension)
+
+
+def choose_owner(path: Path, label: Label, given: Extension | None, why: str) -> Extension:
+    """Return who draws a file: what the user names, and else what the file says.
+
+    The user's word counts, because the other way round a model could not be shown as another renderer, or another
+    program, draws it. A file that says something else is then read with a warning.
+
+    Parameters
+    ----------
+    path : Path
+    label : Label
+        Of the file.
+    given : Extension or None
+        What the user names, with an option or by a run; None for nothing.
+    why : str
+        That, for the warning.
+
+    Raises
+    ------
+    InputError
+        As for :func:`recorded_owner`.
+    """
+    if given is None:
+        return recorded_owner(path, label)
+    warn_of_another(path, label, given.name, why)
+    return given
+
+
+def read_population(path: Path, owner: Extension) -> Any:
+    """Read the population of a PLY or of a compact file.
+
+    Parameters
+    ----------
+    path : Path
+        What has a suffix that no extension knows is read as a PLY.
+    owner : Extension
+        Whose population it is, for a PLY; ``CORE`` for the six fields.
+
+    Raises
+    ------
+    InputError
+        The file is damaged or missing, or does not hold what the extension needs.
+    """
+    format_ = find_format(path)
+    if format_ is None:
+        return owner.load(path, owner.representation.population)
+    if owner.representation.population is not Gaussians:
+        fields = ", ".join(set(owner.representation.population._fields) - set(Gaussians._fields))
+        raise InputError(f"{path}: {format_.suffix} does not hold {fields} of extension {owner.name}: give a PLY")
+    return format_.decode(formats.read_content(path), path)
+
+
+def read_model(path: Path, extension: str | None = None) -> ModelFile:
+    """Read a PLY or a compact file on its own; warn of what it lacks, and of what is left out.
+
+    Parameters
+    ----------
+    path : Path
+    extension : str, optional
+        Who draws it, ``core`` for 3DGS; by default what the file says.
+
+    Raises
+    ------
+    InputError
+        The file is damaged or missing, its extension is not installed, or it does not hold what that needs.
+    """
+    label = label_of(path)
+    given = None
+    if extension is not None:
+        given = CORE if extension == CORE.name else load_extension(extension)
+    owner = choose_owner(path, label, given, f"--extension {extension}")
+    population = read_population(path, owner)
+    if owner is CORE and find_format(path) is None and (further := further_properties(path)):
+        way_out = "" if given is CORE else ": --extension E says what they belong to"
+        _warn(f"{path} also has {', '.join(further)}, which are left out{way_out}")
+    if label.lacks:
+        _warn(f"{path} does not hold {describe_parts(label.lacks)} of its run, which is drawn with it: give the run")
+    return ModelFile(population, owner, label.lacks)
+
+
+def _warn(message: str) -> None:
+    warnings.warn(one_line(message), InputWarning, stacklevel=3)
