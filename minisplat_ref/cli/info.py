@@ -80,6 +80,7 @@ def _ply_rows(path: Path) -> Rows:
     from minisplat_ref.extensions.extension import CORE
     from minisplat_ref.io.ply import further_properties, read_label
     from minisplat_ref.runs.model_file import read_population, recorded_owner
+    from minisplat_ref.types import Gaussians
 
     label = read_label(path)
     try:
@@ -87,16 +88,20 @@ def _ply_rows(path: Path) -> Rows:
     except InputError as error:  # what 3DGS knows of it can be described all the same
         warnings.warn(str(error), InputWarning, stacklevel=2)
         owner = CORE
-    rows = [("PLY", _size(path)), *_label_rows(label), *_field_rows(read_population(path, owner)._asdict())]
-    further = ", ".join(further_properties(path)) if owner is CORE else ""
-    return [*rows, *([("further properties", further)] if further else [])]
+    fields = read_population(path, owner)._asdict()
+    further = []
+    if set(Gaussians._fields) <= set(fields):  # others are named as the file names them
+        fields = {name: fields[name] for name in Gaussians._fields}
+        further = [("further properties", ", ".join(names))] if (names := further_properties(path)) else []
+    return [("PLY", _size(path)), *_label_rows(label), *_field_rows(fields), *further]
 
 
 def _label_rows(label: "Label") -> Rows:
     """Say how a file is drawn, and what it lacks of its run."""
     from minisplat_ref.runs.model_file import describe_parts
 
-    rows = [] if label.extension is None else [("drawn by extension", label.extension)]
+    settings = f", with {', '.join(label.set)}" if label.set else ""
+    rows = [] if label.extension is None else [("drawn by extension", f"{label.extension}{settings}")]
     return [*rows, *([("lacks", f"{describe_parts(label.lacks)} of its run")] if label.lacks else [])]
 
 

@@ -4,7 +4,8 @@ The numbers of a file do not tell which renderer they were trained for: 3DGS dra
 Gaussians without complaint, and worse. Nor does a file hold what every view shows besides Gaussians, such as a sky. So
 a file names the extension that draws it, and what it lacks of its run:
 
-- a PLY in comments of its header, ``comment minisplat_ref extension NAME`` and ``comment minisplat_ref lacks PART``;
+- a PLY in comments of its header: ``comment minisplat_ref extension NAME``, ``comment minisplat_ref set NAME=VALUE``
+  for a setting of its renderer, and ``comment minisplat_ref lacks PART``;
 - a compact format of ours in its own header (:class:`minisplat_ref.io.formats.Format`);
 - a compact format of others in a sidecar, ``FILE.json``, an object with the key ``minisplat_ref``. It has the SHA-256
   of its file, so that it does not speak for another one that is put in its place.
@@ -26,6 +27,7 @@ from minisplat_ref.io.json_file import parse_json, read_json
 
 MARK = "minisplat_ref"  # the first word of our comments, and the key of our sidecars
 NAME = re.compile(r"[^\s/\\]+")  # of an extension or a part
+SETTING = re.compile(r"[^\s=]+=[^\s=]+")
 WAY_OUT = "write the file again with minisplat-ref convert"
 
 
@@ -36,6 +38,8 @@ class Label(NamedTuple):
     """Name of the extension that draws it; None for 3DGS."""
     lacks: tuple[str, ...] = ()
     """Names of the shared parameters that its run is drawn with, and that the file does not hold."""
+    set: tuple[str, ...] = ()
+    """Settings of the extension's renderer, each as ``NAME=VALUE``, that are not its own."""
 
 
 NO_LABEL = Label()
@@ -45,7 +49,8 @@ NO_LABEL = Label()
 def to_comments(label: Label) -> list[str]:
     """Return the comments that a PLY has in its header, without the word ``comment``."""
     extension = [] if label.extension is None else [f"{MARK} extension {label.extension}"]
-    return [*extension, *(f"{MARK} lacks {part}" for part in label.lacks)]
+    settings = [f"{MARK} set {setting}" for setting in label.set]
+    return [*extension, *settings, *(f"{MARK} lacks {part}" for part in label.lacks)]
 
 
 def from_comments(comments: Iterable[str], source: str | Path) -> Label:
@@ -56,7 +61,7 @@ def from_comments(comments: Iterable[str], source: str | Path) -> Label:
     InputError
         They name no extension where one should be, or two.
     """
-    values: dict[str, list[str]] = {"extension": [], "lacks": []}
+    values: dict[str, list[str]] = {"extension": [], "set": [], "lacks": []}
     for comment in comments:
         mark, _, rest = comment.partition(" ")
         key, _, value = rest.partition(" ")
@@ -67,12 +72,12 @@ def from_comments(comments: Iterable[str], source: str | Path) -> Label:
         raise InputError(
             f"{source}: damaged, its comments name the extensions {' and '.join(sorted(names))}; {WAY_OUT}"
         )
-    return from_json({"extension": next(iter(names), None), "lacks": values["lacks"]}, source)
+    return from_json({**values, "extension": next(iter(names), None)}, source)
 
 
 def to_json(label: Label) -> dict[str, Any]:
     """Return the label as JSON holds it."""
-    return {"extension": label.extension, "lacks": list(label.lacks)}
+    return {"extension": label.extension, "set": list(label.set), "lacks": list(label.lacks)}
 
 
 def from_json(value: Any, source: str | Path) -> Label:
@@ -87,11 +92,15 @@ def from_json(value: Any, source: str | Path) -> Label:
         return NO_LABEL
     if not isinstance(value, Mapping):
         raise InputError(f"{source}: damaged, it says {value!r} where it should say what draws it; {WAY_OUT}")
-    extension, lacks = value.get("extension"), value.get("lacks", [])
-    for name in [*([] if extension is None else [extension]), *(lacks if isinstance(lacks, list) else [None])]:
+    extension, lacks, settings = value.get("extension"), value.get("lacks", []), value.get("set", [])
+    names = [] if extension is None else [extension]
+    for name in (*names, *(lacks if isinstance(lacks, list) else [None])):
         if not isinstance(name, str) or not NAME.fullmatch(name):
             raise InputError(f"{source}: damaged, it names what draws it, or what it lacks, as {name!r}; {WAY_OUT}")
-    return Label(extension, tuple(dict.fromkeys(lacks)))
+    for setting in settings if isinstance(settings, list) else [None]:
+        if not isinstance(setting, str) or not SETTING.fullmatch(setting) or extension is None:
+            raise InputError(f"{source}: damaged, it sets {setting!r} of what draws it; {WAY_OUT}")
+    return Label(extension, tuple(dict.fromkeys(lacks)), tuple(dict.fromkeys(settings)))
 
 
 def warn_of_another(path: Path, label: Label, extension: str, why: str) -> None:

@@ -14,10 +14,10 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, owner_of
 from minisplat_ref.io.formats import Format, with_label
 from minisplat_ref.io.frames import frame_of_means, place_scene
-from minisplat_ref.io.label import Label
+from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import are_far
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.runs.model_file import label_for, missing_parts, read_model
+from minisplat_ref.runs.model_file import label_for, read_model
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
 from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, number_views
@@ -37,13 +37,8 @@ class Source(NamedTuple):
     """In a few words."""
     frame: Frame = FILE_FRAME
     """The frame in which it is rendered."""
-    lacks: tuple[str, ...] = ()
-    """Names of the shared parameters that a file lacks of its run."""
-
-    @property
-    def label(self) -> Label:
-        """What a file of its population says about how it is drawn."""
-        return label_for(self.owner, missing_parts((*self.model.shared, *self.lacks)))
+    label: Label = NO_LABEL
+    """What a file of its population is to say about how it is drawn."""
 
 
 class Choice(NamedTuple):
@@ -77,7 +72,7 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     if not path.exists():
         raise InputError(f"{path} does not exist: give a run folder, a checkpoint, a PLY or a compact file")
     read = read_model(path, extension)
-    return Source(Model(read.population), read.owner, path.name, frame_of_means(read.population.means), read.lacks)
+    return Source(Model(read.population), read.owner, path.name, frame_of_means(read.population.means), read.label)
 
 
 def _of_run(folder: Path) -> Source:
@@ -88,7 +83,8 @@ def _of_run(folder: Path) -> Source:
     saved = newest_model(folder, settings)
     what = "the run's result" if saved.unfinished is None else f"iteration {saved.unfinished}"
     owner, frame = owner_of(settings.recipe, settings.extension) or CORE, load_frame(folder)
-    return Source(return_model(saved.model, owner, frame), owner, what, frame)
+    label = label_for(owner, saved.model.shared, settings.set)
+    return Source(return_model(saved.model, owner, frame), owner, what, frame, label)
 
 
 def _of_checkpoint(path: Path) -> Source:
@@ -103,7 +99,8 @@ def _of_checkpoint(path: Path) -> Source:
     owner = CORE if fields == set(Gaussians._fields) else owner_of(written_by(metadata)[0]) or CORE
     bundles = read_bundles(path, arrays, owner.representation.population)
     model, frame = Model(bundles.gaussians, bundles.shared), read_frame(path, metadata)
-    return Source(return_model(model, owner, frame), owner, f"iteration {step}", frame)
+    label = label_for(owner, model.shared, {})
+    return Source(return_model(model, owner, frame), owner, f"iteration {step}", frame, label)
 
 
 def choose_format(path: Path) -> Format | None:

@@ -1,7 +1,7 @@
 """A model's file: who draws it, as its label says, and what it lacks of its run."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from minisplat_ref.io import formats
 from minisplat_ref.io.label import Label, warn_of_another
 from minisplat_ref.io.ply import further_properties, read_label
 from minisplat_ref.training.compensation import COMPENSATION
+from minisplat_ref.training.schedule import configure_renderer, renderer_settings
 from minisplat_ref.training.sky import SKY
 from minisplat_ref.types import Gaussians
 
@@ -24,9 +25,9 @@ class ModelFile(NamedTuple):
 
     population: Any
     owner: Extension
-    """Whose population it is, and who draws it."""
-    lacks: tuple[str, ...] = ()
-    """Names of shared parameters that its run is drawn with, and that the file does not hold."""
+    """Whose population it is, and who draws it, with the settings that the file has."""
+    label: Label
+    """What another file of it is to say."""
 
 
 def missing_parts(shared: Iterable[str]) -> tuple[str, ...]:
@@ -39,9 +40,20 @@ def describe_parts(names: Iterable[str]) -> str:
     return " and ".join(PARTS.get(name, name) for name in names)
 
 
-def label_for(owner: Extension, lacks: Iterable[str] = ()) -> Label:
-    """Return what a file is to say that holds a population of an extension, without these parts of its run."""
-    return owner.label._replace(lacks=tuple(lacks))
+def label_for(owner: Extension, shared: Iterable[str], settings: Mapping[str, str]) -> Label:
+    """Return what a file is to say that holds the population of a run.
+
+    Parameters
+    ----------
+    owner : Extension
+        Whose population it is.
+    shared : iterable of str
+        Names of the shared parameters of the run, which the file does not hold.
+    settings : mapping of str to str
+        Of the run; those of the renderer count.
+    """
+    settings_of_renderer = renderer_settings(owner.representation.renderer, settings)
+    return owner.label._replace(lacks=missing_parts(shared), set=settings_of_renderer)
 
 
 def label_of(path: Path) -> Label:
@@ -71,7 +83,17 @@ def recorded_owner(path: Path, label: Label) -> Extension:
             f"{path} is drawn by extension {label.extension}, which is not installed: let {VARIABLE} name the folder"
             f" that it is in; render and convert take --extension {CORE.name} for what 3DGS knows of it"
         )
-    return load_extension(label.extension)
+    owner = load_extension(label.extension)
+    return _configured(path, owner, label) if label.set else owner
+
+
+def _configured(path: Path, owner: Extension, label: Label) -> Extension:
+    """Return an extension that draws with the settings of a label."""
+    try:
+        renderer = configure_renderer(owner.representation.renderer, label.set)
+    except InputError as error:
+        raise InputError(f"{path} was made for another version of extension {owner.name}: {error}") from None
+    return owner._replace(representation=owner.representation._replace(renderer=renderer))
 
 
 def choose_owner(path: Path, label: Label, given: Extension | None, why: str) -> Extension:
@@ -95,7 +117,7 @@ def choose_owner(path: Path, label: Label, given: Extension | None, why: str) ->
     InputError
         As for :func:`recorded_owner`.
     """
-    if given is None:
+    if given is None or given.name == label.extension:
         return recorded_owner(path, label)
     warn_of_another(path, label, given.name, why)
     return given
@@ -150,7 +172,10 @@ def read_model(path: Path, extension: str | None = None) -> ModelFile:
         _warn(f"{path} also has {', '.join(further)}, which are left out{way_out}")
     if label.lacks:
         _warn(f"{path} does not hold {describe_parts(label.lacks)} of its run, which is drawn with it: give the run")
-    return ModelFile(population, owner, label.lacks)
+    is_as_recorded = owner.name == label.extension
+    return ModelFile(
+        population, owner, owner.label._replace(lacks=label.lacks, set=label.set if is_as_recorded else ())
+    )
 
 
 def _warn(message: str) -> None:

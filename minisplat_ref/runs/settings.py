@@ -31,7 +31,7 @@ from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.methods import RECIPES
-from minisplat_ref.runs.model_file import label_for, missing_parts
+from minisplat_ref.runs.model_file import label_for
 from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.calibration import SHIFTS
@@ -144,7 +144,7 @@ def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> 
     """
     owner = owner_of(settings.recipe, settings.extension) or CORE
     model = return_model(model, owner, frame)
-    owner.save(folder / POINT_CLOUD, model.gaussians, label_for(owner, missing_parts(model.shared)))
+    owner.save(folder / POINT_CLOUD, model.gaussians, label_for(owner, model.shared, settings.set))
     if model.shared:
         with replacing(folder / SHARED) as temporary, open(temporary, "wb") as file:
             np.savez(file, allow_pickle=False, **model.shared)

@@ -36,7 +36,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE
 from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import ViewMetrics, evaluate
-from minisplat_ref.runs.model_file import label_for, missing_parts
+from minisplat_ref.runs.model_file import label_for
 from minisplat_ref.runs.opened_run import Run, check_renderer, check_views
 from minisplat_ref.runs.rate_distortion import PlySize, Point, next_size, paired_drop, smallest_within
 from minisplat_ref.strategy.importance import collect_importance, indoor
@@ -98,13 +98,13 @@ class Decision(NamedTuple):
 
 def ply_size(run: Run) -> PlySize:
     """Return what the PLY of the run's population takes, measured on files of one row and of two."""
-    n_bytes, lacks = [], missing_parts(run.model.shared)
+    n_bytes = []
     with tempfile.TemporaryDirectory() as folder:
         for n in (1, 2):
             path = Path(folder, f"{n}.ply")
             rows, units = take(run.model.gaussians, np.arange(n)), run.owner.representation.units
-            population, label = return_population(rows, units, run.scene.frame), label_for(run.owner, lacks)
-            run.owner.save(path, population, label)
+            label = label_for(run.owner, run.model.shared, run.settings.set)
+            run.owner.save(path, return_population(rows, units, run.scene.frame), label)
             n_bytes.append(path.stat().st_size)
     row = n_bytes[1] - n_bytes[0]
     return PlySize(n_bytes[0] - row - 1, row)

@@ -7,7 +7,7 @@ import functools
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from functools import partial
 from typing import Any, NamedTuple
@@ -320,6 +320,29 @@ def _with_setting(representation: Representation, name: str, value: Any) -> Repr
         extend=_with(representation.extend, name, value),
         renderer=renderer._replace(render=_with(renderer.render, name, value)),
     )
+
+
+def renderer_settings(renderer: Renderer, texts: Mapping[str, str]) -> tuple[str, ...]:
+    """Return those of a run's settings, as ``NAME=VALUE`` without blanks, that are of its renderer."""
+    known = _settings(renderer.render)
+    return tuple("".join(f"{name}={text}".split()) for name, text in texts.items() if name in known)
+
+
+def configure_renderer(renderer: Renderer, settings: Iterable[str]) -> Renderer:
+    """Return a renderer with other settings; this inverts :func:`renderer_settings`.
+
+    Raises
+    ------
+    InputError
+        It has no such setting, or the text is not a value of its type.
+    """
+    known = _settings(renderer.render)
+    for setting in settings:
+        name, _, text = setting.partition("=")
+        if name not in known:
+            raise InputError(f"renderer {renderer.name} has no {name} to set: it has {', '.join(known) or 'none'}")
+        renderer = renderer._replace(render=_with(renderer.render, name, _parse(name, text, known[name], True)))
+    return renderer
 
 
 def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import LEVELS, coarse, finest_densities, insert_levels
 from minisplat_ref.extensions.multi_scale.reference import NO_CELL, are_shown, coverages, pixel_densities
+from minisplat_ref.io.label import Label
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
@@ -300,7 +301,7 @@ def run_folder(scene_folder, tmp_path_factory):
 def test_training_inserts_levels_and_the_ply_keeps_them(run_folder, tmp_path, capsys):
     levels = load_ply(run_folder / "point_cloud.ply", MultiScaleGaussians)
     assert 0 < np.count_nonzero(levels.cells[:, 0]) < len(levels.means)
-    save_ply(tmp_path / "again.ply", levels)
+    save_ply(tmp_path / "again.ply", levels, Label("multi-scale"))
     assert (tmp_path / "again.ply").read_bytes() == (run_folder / "point_cloud.ply").read_bytes()
     events = [json.loads(line) for line in (run_folder / "events.jsonl").read_text().splitlines()]
     assert [event["action"] for event in events].count("insert_levels") == 1

@@ -19,7 +19,7 @@ from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, read_label, save_ply
 from minisplat_ref.io.ply_file import read_vertices
 
-RAYS = Label("rays", ("sky", "compensation"))
+RAYS = Label("rays", ("sky", "compensation"), ("buffer=8",))
 
 
 # PLY
@@ -33,7 +33,7 @@ def test_a_ply_says_it_in_comments_and_holds_the_same(tmp_path):
     plain, labelled = tmp_path / "plain.ply", tmp_path / "labelled.ply"
     save_ply(plain, population())
     save_ply(labelled, population(), RAYS)
-    comments = ["extension rays", "lacks sky", "lacks compensation"]
+    comments = ["extension rays", "set buffer=8", "lacks sky", "lacks compensation"]
     lines = header_of(plain)
     assert not any("comment" in line for line in lines)
     assert header_of(labelled) == [*lines[:2], *(f"comment minisplat_ref {text}" for text in comments), *lines[2:]]
@@ -78,6 +78,9 @@ def test_only_our_comments_count(comments, expected, tmp_path):
         (["minisplat_ref extension rays vr"], "as 'rays vr'"),
         (["minisplat_ref extension ../rays"], "as '../rays'"),
         (["minisplat_ref lacks"], "as ''"),
+        (["minisplat_ref extension vr", "minisplat_ref set buffer_size"], "sets 'buffer_size'"),
+        (["minisplat_ref extension vr", "minisplat_ref set a=1 b=2"], "sets 'a=1 b=2'"),
+        (["minisplat_ref set buffer_size=8"], "sets 'buffer_size=8'"),  # of what?
     ],
 )
 def test_a_damaged_comment_is_refused(comments, named, tmp_path):
@@ -106,7 +109,17 @@ def test_our_formats_say_it_in_their_header(format_, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "entry", ["rays", 3, [], {"extension": 3}, {"lacks": "sky"}, {"lacks": [{}]}, {"extension": ""}]
+    "entry",
+    [
+        "rays",
+        3,
+        [],
+        {"extension": 3},
+        {"lacks": "sky"},
+        {"lacks": [{}]},
+        {"extension": ""},
+        {"extension": "a", "set": "b=1"},
+    ],
 )
 def test_a_damaged_entry_is_refused(entry):
     content = with_header(MSZ.encode(population(3), 0), label=entry)
@@ -135,6 +148,7 @@ def test_another_format_has_a_sidecar(spz, recwarn):
     sidecar = spz.with_name("a.spz.json")
     assert json.loads(sidecar.read_text())["minisplat_ref"] | {"sha256": ""} == {
         "extension": "rays",
+        "set": ["buffer=8"],
         "lacks": ["sky", "compensation"],
         "sha256": "",
     }

@@ -103,6 +103,33 @@ def test_what_3dgs_draws_says_nothing(scene):
     assert CORE.label == NO_LABEL and load_extension("multi-scale").label == Label("multi-scale")
 
 
+@pytest.mark.parametrize(
+    ("name", "given", "recorded"),
+    [("pixel-order", "buffer_size= 1", "buffer_size=1"), ("fans", "max_layers=1", "max_layers=1")],
+)
+def test_a_setting_of_the_renderer_is_recorded(name, given, recorded, scene, tmp_path, capfd):
+    """But not one of the training."""
+    run = train(scene, f"{name}-1", "--recipe", name, "--set", given, "--set", "pose=false")
+    ply, camera = run / "point_cloud.ply", ["--cameras", run / "cameras.json"]
+    assert read_label(ply) == Label(name, (), (recorded,))
+    expected = images(run, tmp_path / "run", "--cameras", "all")
+    assert images(ply, tmp_path / "ply", *camera) == expected
+    assert images(ply, tmp_path / "given", *camera, "--extension", name) == expected
+    convert(ply, tmp_path / "again.ply")
+    convert(run, tmp_path / "run.ply")
+    assert (tmp_path / "again.ply").read_bytes() == ply.read_bytes() == (tmp_path / "run.ply").read_bytes()
+    other = tmp_path / "other.ply"
+    other.write_bytes(ply.read_bytes().replace(f"comment minisplat_ref set {recorded}\n".encode(), b""))
+    assert images(other, tmp_path / "other", *camera) != expected
+    capfd.readouterr()
+    assert main(["info", str(ply)]) == 0
+    assert f"{name}, with {recorded}\n" in capfd.readouterr().out
+    for setting, named in (("size=1", "has no size to set"), (f"{recorded[:-1]}x", "is not a number")):
+        other.write_bytes(ply.read_bytes().replace(recorded.encode(), setting.encode()))
+        line = refused_line(capfd, tmp_path, "render", other, "--out", tmp_path / "views")
+        assert f"{other} was made for another version of extension {name}: " in line and named in line
+
+
 @pytest.mark.parametrize("suffix", [".msz", ".omg", ".spz"])
 def test_compact_files_say_it_too(suffix, run_of, tmp_path, capfd):
     run, file = run_of("rays"), tmp_path / f"a{suffix}"
