@@ -1,0 +1,150 @@
+"""The only module that imports CUDA: compilation of kernels, the device, and what both the simulator and a GPU can do.
+
+Another compiler for the same kernels would be chosen here. Nothing imports this module before a GPU is asked for. With
+``NUMBA_ENABLE_CUDASIM=1`` in the environment, Numba's simulator runs the kernels as Python threads, one block after the
+other; it has no shuffles within a warp, so that :func:`sum_warps` has a second version, which sums in the same order.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.jit import lanes
+
+try:
+    import numba_cuda  # noqa: F401  # Numba's own module of that name is older
+    from numba import cuda
+except ImportError as error:
+    raise InputError("backend cuda needs the package numba-cuda; pip install 'minisplat_ref[cuda]'") from error
+
+__all__ = ["WARP", "check_device", "cuda", "device_function", "gpu_kernel", "is_simulated", "launch", "sum_warps"]
+
+WARP = 32  # threads that run together
+FULL_WARP = 0xFFFFFFFF
+ROW_THREADS = 128  # of a block, where each thread has one Gaussian or pair
+is_simulated = bool(cuda.config.ENABLE_CUDASIM) if hasattr(cuda, "config") else hasattr(cuda, "simulator")
+
+
+def check_device() -> None:
+    """Check that kernels can run.
+
+    Raises
+    ------
+    InputError
+        There is no NVIDIA GPU, or no driver for it.
+    """
+    if is_simulated:
+        return
+    try:
+        found = cuda.is_available() and len(cuda.gpus) > 0
+    except Exception:  # whatever a broken driver raises
+        found = False
+    if not found:
+        raise InputError("backend cuda found no NVIDIA GPU with a working driver; nvidia-smi should list one. Use cpu")
+
+
+class GpuKernel:
+    """A kernel, compiled for the types of its arguments when it is first launched."""
+
+    def __init__(self, function: Callable) -> None:
+        functools.update_wrapper(self, function)
+        self.function = function
+
+    @functools.cached_property
+    def compiled(self) -> Any:
+        """The dispatcher."""
+        return cuda.jit(self.function)
+
+
+def gpu_kernel(function: Callable) -> GpuKernel:
+    """Mark a kernel: a function that every thread of a grid runs."""
+    return GpuKernel(function)
+
+
+def device_function(function: Callable) -> Any:
+    """Mark a function that kernels call and that itself uses ``cuda``."""
+    return cuda.jit(device=True)(function)
+
+
+def launch(kernel: GpuKernel, n_blocks: int, n_threads: int, *args: Any) -> None:
+    """Run a kernel on so many blocks of so many threads; an empty grid does nothing."""
+    if n_blocks > 0:
+        kernel.compiled[n_blocks, n_threads](*args)
+
+
+def launch_rows(kernel: GpuKernel, n_rows: int, *args: Any) -> None:
+    """Run a kernel with one thread for each row, in blocks of ``ROW_THREADS``."""
+    launch(kernel, n_row_blocks(n_rows), ROW_THREADS, *args)
+
+
+def n_row_blocks(n_rows: int) -> int:
+    """Return the number of blocks that :func:`launch_rows` runs."""
+    return -(-n_rows // ROW_THREADS)
+
+
+if is_simulated:
+
+    def sum_warps(values, n_values, is_needed, exchange, sums):
+        """Write the sums over each warp of ``values`` [n_values] of its threads to ``sums`` [warps, n_values].
+
+        All threads of the block call it together. ``exchange`` [threads, n_values] is shared memory, which only the
+        simulator uses; where ``is_needed`` is False in a whole warp, all its values are 0.
+        """
+        thread = cuda.threadIdx.x
+        for k in range(n_values):
+            exchange[thread, k] = values[k]
+        cuda.syncthreads()
+        if thread % WARP == 0:
+            for k in range(n_values):
+                lane_values = np.array([exchange[thread + i, k] for i in range(WARP)])
+                while len(lane_values) > 1:
+                    half = len(lane_values) // 2
+                    lane_values = lane_values[:half] + lane_values[half:]
+                sums[thread // WARP, k] = lane_values[0]
+        cuda.syncthreads()
+
+    sum_warps = device_function(sum_warps)
+
+else:
+    from numba.cuda import libdevice
+    from numba.cuda.extending import overload
+    from numba.cuda import types
+
+    @device_function
+    def sum_warps(values, n_values, is_needed, exchange, sums):
+        """Write the sums over each warp of ``values`` [n_values] of its threads to ``sums`` [warps, n_values]."""
+        thread = cuda.threadIdx.x
+        if cuda.any_sync(FULL_WARP, is_needed):
+            for k in range(n_values):
+                value = values[k]
+                value += cuda.shfl_down_sync(FULL_WARP, value, 16)
+                value += cuda.shfl_down_sync(FULL_WARP, value, 8)
+                value += cuda.shfl_down_sync(FULL_WARP, value, 4)
+                value += cuda.shfl_down_sync(FULL_WARP, value, 2)
+                value += cuda.shfl_down_sync(FULL_WARP, value, 1)
+                if thread % WARP == 0:
+                    sums[thread // WARP, k] = value
+        elif thread % WARP == 0:
+            for k in range(n_values):
+                sums[thread // WARP, k] = values[k]
+
+    # The functions of lanes that have no version for a single number: math.floor would return an integer.
+    @overload(lanes.floor, target="cuda")
+    def _floor(a):
+        if a == types.float32:
+            return lambda a: libdevice.floorf(a)
+        return lambda a: libdevice.floor(a)
+
+    @overload(lanes.ceil, target="cuda")
+    def _ceil(a):
+        if a == types.float32:
+            return lambda a: libdevice.ceilf(a)
+        return lambda a: libdevice.ceil(a)
+
+    @overload(lanes.exp_of, target="cuda")
+    def _exp_of(a):
+        return lambda a: math.exp(a)
