@@ -2,7 +2,7 @@
 
 Another compiler for the same kernels would be chosen here. Nothing imports this module before a GPU is asked for. With
 ``NUMBA_ENABLE_CUDASIM=1`` in the environment, Numba's simulator runs the kernels as Python threads, one block after the
-other; it has no shuffles within a warp, so that :func:`sum_warps` has a second version, which sums in the same order.
+other; it has no shuffles within a warp, so that :func:`reduce_warps` has a second version, which adds in the same order.
 """
 
 import functools
@@ -21,12 +21,25 @@ try:
 except ImportError as error:
     raise InputError("backend cuda needs the package numba-cuda; pip install 'minisplat_ref[cuda]'") from error
 
-__all__ = ["WARP", "check_device", "cuda", "device_function", "gpu_kernel", "is_simulated", "launch", "sum_warps"]
+__all__ = [
+    "ROW_THREADS",
+    "WARP",
+    "GpuKernel",
+    "check_device",
+    "cuda",
+    "device_function",
+    "gpu_kernel",
+    "is_simulated",
+    "launch",
+    "launch_rows",
+    "n_row_blocks",
+    "reduce_warps",
+]
 
 WARP = 32  # threads that run together
 FULL_WARP = 0xFFFFFFFF
 ROW_THREADS = 128  # of a block, where each thread has one Gaussian or pair
-is_simulated = bool(cuda.config.ENABLE_CUDASIM) if hasattr(cuda, "config") else hasattr(cuda, "simulator")
+is_simulated = bool(cuda.config.ENABLE_CUDASIM)
 
 
 def check_device() -> None:
@@ -88,11 +101,23 @@ def n_row_blocks(n_rows: int) -> int:
 
 if is_simulated:
 
-    def sum_warps(values, n_values, is_needed, exchange, sums):
-        """Write the sums over each warp of ``values`` [n_values] of its threads to ``sums`` [warps, n_values].
+    @device_function
+    def reduce_warps(values, n_sums, n_values, is_needed, exchange, out):
+        """Write the sums over each warp of the first ``n_sums`` of ``values``, and the maxima of the others.
 
-        All threads of the block call it together. ``exchange`` [threads, n_values] is shared memory, which only the
-        simulator uses; where ``is_needed`` is False in a whole warp, all its values are 0.
+        All threads of a block call it together.
+
+        Parameters
+        ----------
+        values : array of shape (n_values,)
+            Of the thread.
+        n_sums, n_values : int
+        is_needed : bool
+            Where it is False in a whole warp, all its values are 0.
+        exchange : array of shape (threads, n_values)
+            Shared memory, which only the simulator uses.
+        out : array of shape (warps, n_values)
+            Shared memory; to be read after the block has met.
         """
         thread = cuda.threadIdx.x
         for k in range(n_values):
@@ -100,37 +125,32 @@ if is_simulated:
         cuda.syncthreads()
         if thread % WARP == 0:
             for k in range(n_values):
-                lane_values = np.array([exchange[thread + i, k] for i in range(WARP)])
-                while len(lane_values) > 1:
-                    half = len(lane_values) // 2
-                    lane_values = lane_values[:half] + lane_values[half:]
-                sums[thread // WARP, k] = lane_values[0]
+                of_lanes = np.array([exchange[thread + i, k] for i in range(WARP)])
+                while len(of_lanes) > 1:
+                    low, high = np.split(of_lanes, 2)
+                    of_lanes = low + high if k < n_sums else np.maximum(low, high)
+                out[thread // WARP, k] = of_lanes[0]
         cuda.syncthreads()
 
-    sum_warps = device_function(sum_warps)
-
 else:
-    from numba.cuda import libdevice
+    from numba.cuda import libdevice, types
     from numba.cuda.extending import overload
-    from numba.cuda import types
 
     @device_function
-    def sum_warps(values, n_values, is_needed, exchange, sums):
-        """Write the sums over each warp of ``values`` [n_values] of its threads to ``sums`` [warps, n_values]."""
+    def reduce_warps(values, n_sums, n_values, is_needed, exchange, out):
+        """Write the sums over each warp of the first ``n_sums`` of ``values``, and the maxima of the others."""
         thread = cuda.threadIdx.x
         if cuda.any_sync(FULL_WARP, is_needed):
             for k in range(n_values):
                 value = values[k]
-                value += cuda.shfl_down_sync(FULL_WARP, value, 16)
-                value += cuda.shfl_down_sync(FULL_WARP, value, 8)
-                value += cuda.shfl_down_sync(FULL_WARP, value, 4)
-                value += cuda.shfl_down_sync(FULL_WARP, value, 2)
-                value += cuda.shfl_down_sync(FULL_WARP, value, 1)
+                for step in (16, 8, 4, 2, 1):
+                    other = cuda.shfl_down_sync(FULL_WARP, value, step)
+                    value = value + other if k < n_sums else lanes.maximum(value, other)
                 if thread % WARP == 0:
-                    sums[thread // WARP, k] = value
+                    out[thread // WARP, k] = value
         elif thread % WARP == 0:
             for k in range(n_values):
-                sums[thread // WARP, k] = values[k]
+                out[thread // WARP, k] = values[k]
 
     # The functions of lanes that have no version for a single number: math.floor would return an integer.
     @overload(lanes.floor, target="cuda")

@@ -13,7 +13,7 @@ import numpy as np
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS
 from minisplat_ref.cuda.compositing.records import COLOR
 from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, pixel_of, read_batch
-from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, sum_warps
+from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, reduce_warps
 from minisplat_ref.jit.lanes import select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.scalar.compositing import blend, sigma_vjp
@@ -75,7 +75,7 @@ def backward_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
                 q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
                 summed[0], summed[1], summed[2] = q_shape, q_mean * e, q_mean * dy
                 summed[3], summed[4], summed[5] = q_shape * e * e, q_shape * e * dy, q_shape * dy * dy
-                sum_warps(summed, n_sums, weight > ZERO, exchange, partial[j])
+                reduce_warps(summed, n_sums, n_sums, weight > ZERO, exchange, partial[j])
             cuda.syncthreads()
             for i in range(thread, n_listed * n_sums, BLOCK):
                 j = i // n_sums
@@ -87,7 +87,7 @@ def backward_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
         cuda.syncthreads()
         for k in range(n_channels):
             summed[k] = abs(T) * v[k]
-        sum_warps(summed, n_channels, True, exchange, partial[0])
+        reduce_warps(summed, n_channels, n_channels, True, exchange, partial[0])
         cuda.syncthreads()
         if thread < n_channels:
             total = partial[0, 0, thread]

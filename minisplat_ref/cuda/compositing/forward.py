@@ -11,11 +11,11 @@ import functools
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
-from minisplat_ref.cuda.compositing.pair_sums import N_PAIR_STATS
+from minisplat_ref.cuda.compositing.pair_sums import HIT_COUNT, N_PAIR_STATS, N_PAIR_SUMS, WEIGHT_MAX, WEIGHT_SUM
 from minisplat_ref.cuda.compositing.records import COLOR
 from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, pixel_of, read_batch
-from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, max_warps, sum_warps
-from minisplat_ref.jit.lanes import maximum
+from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, reduce_warps
+from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.scalar.compositing import blend
 
@@ -26,7 +26,7 @@ MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKernel:
     """Return the forward kernel for a dtype, a number of channels, with or without statistics."""
     n_fields, n_colors, real = COLOR + n_channels, max(n_channels, 1), dtype.type
-    n_exchanged = BLOCK if has_stats else 1
+    n_exchanged = BLOCK if has_stats and is_simulated else 1
     n_partial = BATCH if has_stats else 1
 
     @gpu_kernel
@@ -46,7 +46,7 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
         partial = cuda.shared.array((n_partial, N_WARPS, N_PAIR_STATS), dtype)
         exchange = cuda.shared.array((n_exchanged, N_PAIR_STATS), dtype)
         color = cuda.local.array(n_colors, dtype)
-        summed = cuda.local.array(N_PAIR_STATS, dtype)
+        values = cuda.local.array(N_PAIR_STATS, dtype)
         x, y = pixel_of(frame)
         is_pixel = x < frame.width and y < frame.height
         center_x, center_y = real(x) + HALF, real(y) + HALF
@@ -72,20 +72,19 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
                     after = abs(T)
                     if after < MEDIAN and after + weight >= MEDIAN:
                         crossing = depths[n]
-                    summed[0], summed[1], summed[2] = weight, weight, ONE if weight > ZERO else ZERO
-                    sum_warps(summed, N_PAIR_STATS, weight > ZERO, exchange, partial[j])
-                    max_warps(weight, 1, exchange, partial[j])
+                    values[WEIGHT_SUM], values[HIT_COUNT], values[WEIGHT_MAX] = weight, select(weight > ZERO, ONE, ZERO), weight
+                    reduce_warps(values, N_PAIR_SUMS, N_PAIR_STATS, weight > ZERO, exchange, partial[j])
             if has_stats:
                 cuda.syncthreads()
                 if cuda.threadIdx.x < n_listed:
                     j = cuda.threadIdx.x
                     slot = slots_of[start + j]
-                    total, largest, hits = real(0), real(0), real(0)
+                    total, hits, largest = real(0), real(0), real(0)
                     for warp in range(N_WARPS):
-                        total += partial[j, warp, 0]
-                        largest = maximum(largest, partial[j, warp, 1])
-                        hits += partial[j, warp, 2]
-                    slots[slot, 0], slots[slot, 1], slots[slot, 2] = total, largest, hits
+                        total += partial[j, warp, WEIGHT_SUM]
+                        hits += partial[j, warp, HIT_COUNT]
+                        largest = maximum(largest, partial[j, warp, WEIGHT_MAX])
+                    slots[slot, WEIGHT_SUM], slots[slot, HIT_COUNT], slots[slot, WEIGHT_MAX] = total, hits, largest
         if is_pixel:
             left = abs(T)
             alpha[y, x] = ONE - left

@@ -8,7 +8,8 @@ from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors, mean_vjp_of_moments
 
 N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
-N_PAIR_STATS = 3  # sum of the weights, largest weight, number of hits
+WEIGHT_SUM, HIT_COUNT, WEIGHT_MAX = range(3)  # of a pair
+N_PAIR_SUMS, N_PAIR_STATS = 2, 3
 
 
 @gpu_kernel
@@ -53,7 +54,7 @@ def sum_pair_stats(slots, offsets, weight_sums, weight_maxima, hit_counts):
         return
     total, largest, n_hits = np.float64(0), slots.dtype.type(0), 0
     for slot in range(offsets[n], offsets[n + 1]):
-        total += slots[slot, 0]
-        largest = maximum(largest, slots[slot, 1])
-        n_hits += int(slots[slot, 2])
+        total += slots[slot, WEIGHT_SUM]
+        largest = maximum(largest, slots[slot, WEIGHT_MAX])
+        n_hits += int(slots[slot, HIT_COUNT])
     weight_sums[n], weight_maxima[n], hit_counts[n] = total, largest, n_hits

@@ -10,7 +10,7 @@ from minisplat_ref.cuda.compositing.records import HALF_A, HALF_PIVOT, MEAN_X, M
 from minisplat_ref.cuda.target import WARP, cuda, device_function
 from minisplat_ref.cuda.tiling import TILE
 from minisplat_ref.jit.lanes import exp_of, select
-from minisplat_ref.jit.literals import HALF, ZERO
+from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import Frame, mahalanobis
 from minisplat_ref.types import Floats, Ints, TileBins
 
@@ -72,4 +72,4 @@ def hit(batch, j, center_x, center_y):
     is_inside = (
         (batch[j, X0] < center_x) & (center_x < batch[j, X1]) & (batch[j, Y0] < center_y) & (center_y < batch[j, Y1])
     )
-    return select(is_inside, batch[j, OPACITY] * exp_of(-sigma), ZERO * HALF), e, dy
+    return select(is_inside, batch[j, OPACITY] * exp_of(-sigma), ZERO), e, dy
