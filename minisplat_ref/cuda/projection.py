@@ -173,9 +173,7 @@ def project_rows_vjp(
         v_p, v_V = project_gaussian_vjp(p, V, constants, footprint, v_x, v_y, v_z, v_cov)
         R_transposed = transpose3(R)
         v_quat, v_scale = axes_vjp(quat, scale, matmul3(R_transposed, v_V))
-        store_triple(
-            out.means, n, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p))
-        )
+        store_triple(out.means, n, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
         store_triple(out.scales, n, v_scale)
         store_triple(out.quats, n, v_quat)
         out.quats[n, 3] = v_quat[3]

@@ -11,7 +11,15 @@ import numpy as np
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cuda.arrays import empty, to_device, to_host
 from minisplat_ref.cuda.projection import sum_parts, wide_triple
-from minisplat_ref.cuda.target import ROW_THREADS, GpuKernel, cuda, device_function, gpu_kernel, launch_rows, n_row_blocks
+from minisplat_ref.cuda.target import (
+    ROW_THREADS,
+    GpuKernel,
+    cuda,
+    device_function,
+    gpu_kernel,
+    launch_rows,
+    n_row_blocks,
+)
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.spherical_harmonics import (

@@ -72,7 +72,11 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
                     after = abs(T)
                     if after < MEDIAN and after + weight >= MEDIAN:
                         crossing = depths[n]
-                    values[WEIGHT_SUM], values[HIT_COUNT], values[WEIGHT_MAX] = weight, select(weight > ZERO, ONE, ZERO), weight
+                    values[WEIGHT_SUM], values[HIT_COUNT], values[WEIGHT_MAX] = (
+                        weight,
+                        select(weight > ZERO, ONE, ZERO),
+                        weight,
+                    )
                     reduce_warps(values, N_PAIR_SUMS, N_PAIR_STATS, weight > ZERO, exchange, partial[j])
             if has_stats:
                 cuda.syncthreads()
