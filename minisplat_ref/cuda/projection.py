@@ -210,4 +210,5 @@ def project_vjp(
         v_poses,
     )
     v_pose = np.sum(to_host(v_poses), axis=0).reshape(3, 4).astype(dtype)
-    return PrimitiveGradient(*to_host(out), v_pose[:, :3].copy(), v_pose[:, 3].copy())
+    v = to_host(out)
+    return PrimitiveGradient(v.means, v.quats, v.scales, v.opacities, v_pose[:, :3].copy(), v_pose[:, 3].copy())

@@ -178,4 +178,5 @@ def sh_colors_vjp(
     # Sum over the Gaussians of the gradient with respect to their offset, mean - centre, with centre = -R^T t.
     v_offset = np.sum(to_host(v_offsets), axis=0)
     v_R, v_t = np.outer(camera.cam_from_world_t, v_offset), camera.cam_from_world_R @ v_offset
-    return SHGradient(*map(to_host, out), v_R.astype(dtype), v_t.astype(dtype))
+    v_means, v_dc, v_rest = map(to_host, out)
+    return SHGradient(v_means, v_dc, v_rest, v_R.astype(dtype), v_t.astype(dtype))

@@ -2,7 +2,7 @@
 
 Another compiler for the same kernels would be chosen here. Nothing imports this module before a GPU is asked for. With
 ``NUMBA_ENABLE_CUDASIM=1`` in the environment, Numba's simulator runs the kernels as Python threads, one block after the
-other; it has no shuffles within a warp, so that :func:`reduce_warps` has a second version, which adds in the same order.
+other. It has no shuffles within a warp: :func:`reduce_warps` has a second version for it, which adds in the same order.
 """
 
 import functools
@@ -16,10 +16,12 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.jit import lanes
 
 try:
+    import numba.cuda
     import numba_cuda  # noqa: F401  # Numba's own module of that name is older
-    from numba import cuda
 except ImportError as error:
     raise InputError("backend cuda needs the package numba-cuda; pip install 'minisplat_ref[cuda]'") from error
+
+cuda: Any = numba.cuda
 
 __all__ = [
     "ROW_THREADS",

@@ -17,13 +17,13 @@ from unittest.mock import patch
 import numpy as np
 from numba.cuda import dispatcher
 from numba.cuda.typing.typeof import Purpose, typeof
-from scenes import activated, as_dtype, make_camera, make_gaussians
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.cuda import arrays, compositing, projection, spherical_harmonics, tiling
 from minisplat_ref.cuda.target import GpuKernel, cuda
 from minisplat_ref.types import ProjectionGradient, TileGrid
+from scenes import activated, as_dtype, make_camera, make_gaussians
 
 
 def find_ptxas():

@@ -3,7 +3,8 @@
 The number of channels, the dtype and whether statistics are collected are compile-time constants. A thread keeps its
 pixel's transmittance, negative once the pixel is finished, and its colour; the block stops when no pixel is open.
 
-The statistics of one Gaussian in one tile go into the slot of this pair: sums over a warp, then over the warps in order.
+The statistics of one Gaussian in one tile go into the slot of this pair: reduced over each warp, then over the warps in
+order.
 """
 
 import functools
