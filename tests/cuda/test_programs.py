@@ -1,4 +1,4 @@
-"""The kernels of the backend cuda, compiled without a GPU: registers, spills, and no float64 where pixels are blended."""
+"""The kernels of the backend cuda, compiled without a GPU: registers, spills, and no float64 in blending."""
 
 import ast
 import json

@@ -85,8 +85,9 @@ def test_the_cases_reach_what_they_are_for(simulated):
         assert np.max(np.diff(results[name]["bins"].tile_offsets)) > 32  # Gaussians that are read at once
     late = results["two batches"]["bins"].gaussian_ids[33:]
     assert np.any(results["two batches"]["output"].stats.hit_count[late] > 0)
-    opaque = results["opaque"]["output"]
-    assert np.all(opaque.alpha > 0.999)  # every pixel is finished, and so is the block
+    hidden = results["opaque"]["bins"].gaussian_ids[32:]  # every pixel is finished, and so is the block
+    assert np.all(results["opaque"]["projection"].opacities[hidden] > 0.9)
+    assert np.all(results["opaque"]["output"].stats.hit_count[hidden] == 0)
     assert np.any(results["four tiles"]["output"].median_depth > 0)
 
 

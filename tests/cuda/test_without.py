@@ -9,6 +9,7 @@ import pytest
 
 from minisplat_ref.backends import CPU, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.cpu.compositing.tile_state import lists_of
 from minisplat_ref.errors import InputError
 from minisplat_ref.types import TileGrid
 from scenes import activated, make_camera, make_gaussians
@@ -61,8 +62,7 @@ def test_kernels_of_the_cpu_refuse_other_tiles():
     camera, g = make_camera(40, 30), make_gaussians(np.random.default_rng(0), 3)
     projection = CPU.project(*activated(g), camera, GSPLAT_MAIN)
     bins = CPU.bin_gaussians(projection, TileGrid(40, 30, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
-    colors = np.ones((3, 3))
-    CPU.composite(projection, colors, np.zeros(3), bins, GSPLAT_MAIN)
+    lists_of(bins)
     bins = bins._replace(grid=TileGrid(40, 30, 16, 16))
     with pytest.raises(InputError, match="32 x 16 pixels, not of 16 x 16"):
-        CPU.composite(projection, colors, np.zeros(3), bins, GSPLAT_MAIN)
+        lists_of(bins)

@@ -1,17 +1,19 @@
 """Run the stages of the backend cuda on tiny scenes and write what they return; in a process with Numba's simulator.
 
-``NUMBA_ENABLE_CUDASIM=1 python cuda_stages.py FILE`` writes a pickle: for each case, the results by stage. The cases and
-their inputs are functions of this file, so that the tests can give the same inputs to the reference.
+``NUMBA_ENABLE_CUDASIM=1 python cuda_stages.py FILE`` writes a pickle: for each case, the results by stage. The cases
+and their inputs are functions of this file, so that the tests can give the same inputs to the reference.
 """
 
 import pickle
 import sys
+from dataclasses import fields
+from inspect import signature
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend, get_backend
+from minisplat_ref.backends import REFERENCE, Backend, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, MINI_SPLATTING2, Conventions
 from minisplat_ref.types import Primitives, ProjectionGradient, TileGrid
 from scenes import activated, as_dtype, make_camera, make_gaussians
@@ -42,7 +44,7 @@ CASES = {
 
 
 def run_stages(case: Case, backend: Backend, dtype: type, given: dict | None = None) -> dict:
-    """Run every stage of a backend once; each takes its inputs from ``given``, results of another backend, or its own."""
+    """Run every stage of a backend once, on results of another backend if they are ``given``, else on its own."""
     rng = np.random.default_rng(list(CASES).index(next(name for name in CASES if CASES[name] == case)))
     width, height = case.size
     camera = make_camera(width, height, fx=1.2 * width, fy=1.3 * width, cx=0.45 * width, rng=rng)
@@ -85,6 +87,9 @@ def run_stages(case: Case, backend: Backend, dtype: type, given: dict | None = N
 if __name__ == "__main__":
     cuda = get_backend("cuda")
     assert (cuda.tile_width, cuda.tile_height) == (TILE, TILE)
+    for field in fields(cuda)[4:]:
+        stage, twin = getattr(cuda, field.name), getattr(REFERENCE, field.name)
+        assert list(signature(stage).parameters) == list(signature(twin).parameters), field.name
     results = {name: run_stages(case, cuda, case.dtype) for name, case in CASES.items()}
     again = run_stages(CASES["four tiles"], cuda, np.float32)["output_vjp"]
     Path(sys.argv[1]).write_bytes(pickle.dumps((results, again)))

@@ -1,9 +1,9 @@
 """The backward kernel: loop over every tile's Gaussians, front to back once more, and sum each Gaussian's gradient.
 
-The arithmetic is that of the CPU's kernel, see :mod:`minisplat_ref.cpu.compositing.backward`: a thread keeps its
-pixel's transmittance and the part of <v, image> behind the current hit, and a Gaussian's gradient is made of six moments of
-q = dL/dsigma and the sums of its colours. There are no atomic operations: moments are summed over each warp, the warps'
-sums are added in order into the slot of the pair (tile, Gaussian), and slots are summed in order afterwards.
+The arithmetic is that of the CPU's kernel, see :mod:`minisplat_ref.cpu.compositing.backward`. A thread keeps its
+pixel's transmittance and the part of <v, image> behind the current hit; the gradient of a Gaussian is made of six
+moments of q = dL/dsigma and the sums of its colours. There are no atomic operations: moments are summed over each warp,
+the warps' sums are added in order into the slot of the pair (tile, Gaussian), and slots are summed in order afterwards.
 """
 
 import functools
