@@ -106,9 +106,8 @@ def project(
         empty((n, 2), np.int32),
         empty((n, 4), np.int32),
     )
-    extent = Extent(
-        dtype.type(conventions.alpha_min), conventions.has_full_support, np.int32(camera.width), np.int32(camera.height)
-    )
+    alpha_min = dtype.type(conventions.alpha_min)
+    extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
     primitives, pose = to_device(Primitives(means, quats, scales, opacities)), to_device(pose_of(camera))
     launch_rows(project_rows, n, primitives, pose, constants_of(camera, conventions), extent, out)
     return to_host(out)

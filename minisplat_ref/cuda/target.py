@@ -135,8 +135,9 @@ if is_simulated:
         cuda.syncthreads()
 
 else:
-    from numba.cuda import libdevice, types
+    from numba.cuda import libdevice
     from numba.cuda.extending import overload
+    from numba.cuda.types import float32
 
     @device_function
     def reduce_warps(values, n_sums, n_values, is_needed, exchange, out):
@@ -157,13 +158,13 @@ else:
     # The functions of lanes that have no version for a single number: math.floor would return an integer.
     @overload(lanes.floor, target="cuda")
     def _floor(a):
-        if a == types.float32:
+        if a == float32:
             return lambda a: libdevice.floorf(a)
         return lambda a: libdevice.floor(a)
 
     @overload(lanes.ceil, target="cuda")
     def _ceil(a):
-        if a == types.float32:
+        if a == float32:
             return lambda a: libdevice.ceilf(a)
         return lambda a: libdevice.ceil(a)
 

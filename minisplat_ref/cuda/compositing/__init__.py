@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.compositing.tile_state import frame_of
 from minisplat_ref.cuda.arrays import empty, to_device, to_host, zeros
 from minisplat_ref.cuda.compositing.backward import backward_kernel
 from minisplat_ref.cuda.compositing.forward import forward_kernel
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS, N_PAIR_STATS, sum_pair_stats, sum_slots
 from minisplat_ref.cuda.compositing.records import records_of
-from minisplat_ref.cuda.compositing.tiles import BLOCK, Lists, Pixels, frame_of
+from minisplat_ref.cuda.compositing.tiles import BLOCK, Lists, Pixels
 from minisplat_ref.cuda.target import launch, launch_rows
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
@@ -50,7 +51,8 @@ def composite(
         sums = empty(n, dtype), empty(n, dtype), empty(n, np.int32)
         launch_rows(sum_pair_stats, n, slots, to_device(bins.gaussian_offsets), *sums)
         dominant_count = np.bincount(ids[ids >= 0], minlength=n).astype(np.int32)
-        stats = BlendStats(*map(to_host, sums), dominant_count, ids)
+        weight_sum, weight_max, hit_count = map(to_host, sums)
+        stats = BlendStats(weight_sum, weight_max, hit_count, dominant_count, ids)
     image, alpha = to_host(pixels)
     return RenderOutput(image, alpha, to_host(median_depth) if with_median_depth else None, stats)
 
@@ -87,7 +89,7 @@ def composite_vjp(
         empty((n, 3), projection.conics.dtype),
         empty(n, projection.opacities.dtype),
         empty((n, n_channels), dtype),
-        np.sum(to_host(v_backgrounds), axis=0, dtype=np.float64).astype(dtype),
+        to_host(v_backgrounds).sum(axis=0, dtype=np.float64).astype(dtype),
     )
     offsets = to_device(bins.gaussian_offsets)
     conics, opacities = to_device(projection.conics), to_device(projection.opacities)

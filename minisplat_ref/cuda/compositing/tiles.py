@@ -2,17 +2,13 @@
 
 from typing import NamedTuple
 
-import numpy as np
-
-from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.compositing.tile_state import frame_of as cpu_frame_of
 from minisplat_ref.cuda.compositing.records import HALF_A, HALF_PIVOT, MEAN_X, MEAN_Y, OPACITY, SLOPE, X0, X1, Y0, Y1
 from minisplat_ref.cuda.target import WARP, cuda, device_function
 from minisplat_ref.cuda.tiling import TILE
 from minisplat_ref.jit.lanes import exp_of, select
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.scalar.compositing import Frame, mahalanobis
-from minisplat_ref.types import Floats, Ints, TileBins
+from minisplat_ref.scalar.compositing import mahalanobis
+from minisplat_ref.types import Floats, Ints
 
 BLOCK = TILE * TILE
 N_WARPS = BLOCK // WARP
@@ -37,12 +33,6 @@ class Pixels(NamedTuple):
     """[H, W, D]."""
     alpha: Floats
     """[H, W]."""
-
-
-def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
-    """Return image size and thresholds in the form that kernels take, with sizes as int32."""
-    frame = cpu_frame_of(bins, conventions, dtype)
-    return frame._replace(width=np.int32(frame.width), height=np.int32(frame.height))
 
 
 @device_function
