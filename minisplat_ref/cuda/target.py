@@ -66,7 +66,6 @@ class GpuKernel:
     """A kernel, compiled for the types of its arguments when it is first launched."""
 
     def __init__(self, function: Callable) -> None:
-        functools.update_wrapper(self, function)
         self.function = function
 
     @functools.cached_property
@@ -136,8 +135,8 @@ if is_simulated:
 
 else:
     from numba.cuda import libdevice
-    from numba.cuda.extending import overload
-    from numba.cuda.types import float32
+    from numba.cuda.extending import overload  # type: ignore[attr-defined]
+    from numba.cuda.types import float32  # type: ignore[attr-defined]
 
     @device_function
     def reduce_warps(values, n_sums, n_values, is_needed, exchange, out):
