@@ -5,6 +5,7 @@ respect to the camera's pose is summed as in :mod:`minisplat_ref.cuda.projection
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,29 @@ from minisplat_ref.scalar.spherical_harmonics import (
     direction_vjp,
 )
 from minisplat_ref.types import Camera, Floats, Ints, SHGradient
+
+
+class Shaded(NamedTuple):
+    """The fields of the Gaussians on which colours depend, or the gradient with respect to them."""
+
+    means: Floats
+    """[N, 3] world frame."""
+    sh_dc: Floats
+    """[N, 3]."""
+    sh_rest: Floats
+    """[N, K-1, 3]."""
+
+
+class Harmonics(NamedTuple):
+    """The viewpoint and the basis functions."""
+
+    centre: Floats
+    """[3] of the camera, float64."""
+    constants: Floats
+    """[10] of degrees 0, 1, 2 (3) and 3 (5)."""
+    degrees: Ints
+    """[N] uint8, active degree of each Gaussian."""
+
 
 _CONSTANTS = (SH_C0, SH_C1, *SH_C2, *SH_C3)
 N_REST = 15  # basis functions of degrees 1 to 3
@@ -72,7 +96,9 @@ def colors_kernel(dtype: np.dtype) -> GpuKernel:
     real = dtype.type
 
     @gpu_kernel
-    def color_rows(means, sh_dc, sh_rest, centre, c, degrees, radii, colors):
+    def color_rows(shaded, harmonics, radii, colors):
+        means, sh_dc, sh_rest = shaded
+        centre, c, degrees = harmonics
         n = cuda.grid(1)
         if n >= means.shape[0]:
             return
@@ -98,7 +124,9 @@ def colors_vjp_kernel(dtype: np.dtype) -> GpuKernel:
     real = dtype.type
 
     @gpu_kernel
-    def color_rows_vjp(means, sh_dc, sh_rest, centre, c, degrees, radii, v_colors, out, v_offsets):
+    def color_rows_vjp(shaded, harmonics, radii, v_colors, out, v_offsets):
+        means, sh_dc, sh_rest = shaded
+        centre, c, degrees = harmonics
         parts = cuda.shared.array((ROW_THREADS, 3), np.float64)
         y = cuda.local.array(N_REST, dtype)
         n, thread = cuda.grid(1), cuda.threadIdx.x
@@ -150,18 +178,16 @@ def colors_vjp_kernel(dtype: np.dtype) -> GpuKernel:
     return color_rows_vjp
 
 
-def _view_of(camera: Camera, degree: int | Ints, means: Floats) -> tuple[Floats, Floats, Ints]:
-    """Return the camera's centre, the constants of the basis and each Gaussian's degree, on the device."""
+def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
     degrees = np.full(len(means), degree, np.uint8)
-    constants = np.array(_CONSTANTS, means.dtype)
-    return to_device(camera.astype(np.float64).center), to_device(constants), to_device(degrees)
+    return Harmonics(camera.astype(np.float64).center, np.array(_CONSTANTS, means.dtype), degrees)
 
 
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
     """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
     colors = empty(sh_dc.shape, sh_dc.dtype)
-    inputs = to_device(means), to_device(sh_dc), to_device(sh_rest), *_view_of(camera, degree, means)
-    launch_rows(colors_kernel(means.dtype), len(means), *inputs, to_device(radii), colors)
+    shaded, harmonics = to_device(Shaded(means, sh_dc, sh_rest)), to_device(_harmonics(camera, degree, means))
+    launch_rows(colors_kernel(means.dtype), len(means), shaded, harmonics, to_device(radii), colors)
     return to_host(colors)
 
 
@@ -170,13 +196,17 @@ def sh_colors_vjp(
 ) -> SHGradient:
     """Chain the gradient of the colours to their inputs; see ``reference.spherical_harmonics.sh_colors_vjp``."""
     dtype = means.dtype
-    out = empty(means.shape, dtype), empty(sh_dc.shape, dtype), empty(sh_rest.shape, dtype)
+    out = Shaded(empty(means.shape, dtype), empty(sh_dc.shape, dtype), empty(sh_rest.shape, dtype))
     v_offsets = empty((n_row_blocks(len(means)), 3), np.float64)
-    inputs = to_device(means), to_device(sh_dc), to_device(sh_rest), *_view_of(camera, degree, means)
-    arguments = (*inputs, to_device(radii), to_device(v_colors), out, v_offsets)
-    launch_rows(colors_vjp_kernel(dtype), len(means), *arguments)
+    shaded, harmonics = to_device(Shaded(means, sh_dc, sh_rest)), to_device(_harmonics(camera, degree, means))
+    launch_rows(
+        colors_vjp_kernel(dtype),
+        len(means),
+        *(shaded, harmonics, to_device(radii), to_device(v_colors)),
+        *(out, v_offsets),
+    )
     # Sum over the Gaussians of the gradient with respect to their offset, mean - centre, with centre = -R^T t.
     v_offset = np.sum(to_host(v_offsets), axis=0)
     v_R, v_t = np.outer(camera.cam_from_world_t, v_offset), camera.cam_from_world_R @ v_offset
-    v_means, v_dc, v_rest = map(to_host, out)
-    return SHGradient(v_means, v_dc, v_rest, v_R.astype(dtype), v_t.astype(dtype))
+    v = to_host(out)
+    return SHGradient(v.means, v.sh_dc, v.sh_rest, v_R.astype(dtype), v_t.astype(dtype))
