@@ -11,6 +11,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 Commands = argparse._SubParsersAction
 
 BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
+CUDA = "cuda"  # needs a GPU
 SYNTHETIC_SCENES = ("room", "plain-wall", "glossy", "outdoor")  # datasets.synthetic.SCENE_NAMES, which would load NumPy
 
 
@@ -120,10 +121,10 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
     )
     parser.add_argument(
         "--backend",
-        choices=BACKENDS,
+        choices=(*BACKENDS, CUDA),
         default=default,
         metavar="NAME",
-        help=f"cpu, cpu-exact or reference (default {whose}cpu)",
+        help=f"cpu, cpu-exact, reference or, with an NVIDIA GPU, cuda (default {whose}cpu)",
     )
 
 

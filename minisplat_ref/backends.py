@@ -4,6 +4,7 @@
 the only module that sees both the reference and the kernels.
 """
 
+import functools
 from dataclasses import dataclass, replace
 
 from minisplat_ref import stages
@@ -122,6 +123,41 @@ PLAIN = replace(
 """The same with the kernels that blend any primitive; they have no statistics, so it is not in ``BACKENDS``."""
 
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
+"""The backends that are there on every machine."""
+
+CUDA = "cuda"
+"""The name of the one that :func:`load_cuda` loads."""
+
+
+@functools.cache
+def load_cuda() -> Backend:
+    """Return the backend for an NVIDIA GPU; nothing imports CUDA before.
+
+    Projection, colours, tiling and blending run on the GPU; losses, Adam, surface points and removal are those of the
+    CPU. Arrays are copied to the GPU and back in each stage.
+
+    Raises
+    ------
+    InputError
+        There is no numba-cuda, no GPU, or no driver.
+    """
+    from minisplat_ref.cuda import compositing, projection, removal, spherical_harmonics, target, tiling
+
+    target.check_device()
+    return replace(
+        CPU,
+        name="cuda",
+        tile_width=tiling.TILE,
+        tile_height=tiling.TILE,
+        project=projection.project,
+        project_vjp=projection.project_vjp,
+        sh_colors=spherical_harmonics.sh_colors,
+        sh_colors_vjp=spherical_harmonics.sh_colors_vjp,
+        bin_gaussians=tiling.bin_gaussians,
+        composite=compositing.composite,
+        composite_vjp=compositing.composite_vjp,
+        removal_changes=removal.removal_changes,
+    )
 
 
 def get_backend(name: str) -> Backend:
@@ -130,18 +166,20 @@ def get_backend(name: str) -> Backend:
     Parameters
     ----------
     name : str
-        ``"cpu"``, ``"cpu-exact"`` or ``"reference"``.
+        ``"cpu"``, ``"cpu-exact"``, ``"reference"`` or ``"cuda"``.
 
     Returns
     -------
     Backend
-        The value of that name in this module.
+        The value of that name in this module, or that of :func:`load_cuda`.
 
     Raises
     ------
     InputError
-        If there is none.
+        There is none, or its hardware or package is missing.
     """
+    if name == CUDA:
+        return load_cuda()
     if name not in BACKENDS:
-        raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(sorted(BACKENDS))}")
+        raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(sorted((*BACKENDS, CUDA)))}")
     return BACKENDS[name]

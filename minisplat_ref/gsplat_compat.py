@@ -105,7 +105,7 @@ def rasterization(
     covars : ndarray of shape (N, 3, 3), optional
         Covariances in place of `quats` and `scales`, which are not read and may be None; of a matrix the upper triangle
         is read.
-    backend : {"cpu", "cpu-exact", "reference"} or Backend
+    backend : {"cpu", "cpu-exact", "reference", "cuda"} or Backend
         Implementation of the stages.
     profile : str or Conventions
         Name in ``PROFILES``, or a value; its ``is_antialiased`` gives way to `rasterize_mode`.

@@ -27,7 +27,7 @@ from minisplat_ref.cpu.gaussian_rows import (
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, iota, scatter, select
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.scalar.extent import Extent, inria_box, support_box
+from minisplat_ref.scalar.extent import Extent, inria_box, is_seen, support_box
 from minisplat_ref.scalar.projection import (
     Pose,
     ProjectionConstants,
@@ -98,28 +98,27 @@ def _project_eight(rows, primitives, pose, constants, extent, out):
         rx, ry, x0, y0, x1, y1 = support_box(footprint, opacity, extent.alpha_min, extent.width, extent.height)
     else:
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, extent.width, extent.height)
-    is_seen = (p[2] > constants.near) & (p[2] < constants.far) & (opacity >= extent.alpha_min) & (footprint.det > ZERO)
-    size = footprint.det + abs(a) + abs(c) + abs(footprint.x) + abs(footprint.y)  # finite if all of them are
-    is_seen = is_seen & (size < np.inf) & (rx > ZERO) & (ry > ZERO) & (x1 > x0) & (y1 > y0)
-    _scatter_seen(is_seen, out.means2d, rows, 0, footprint.x)
-    _scatter_seen(is_seen, out.means2d, rows, 1, footprint.y)
-    _scatter_seen(is_seen, out.depths, rows, 0, p[2])
-    _scatter_seen(is_seen, out.conics, rows, 0, a)
-    _scatter_seen(is_seen, out.conics, rows, 1, b)
-    _scatter_seen(is_seen, out.conics, rows, 2, c)
-    _scatter_seen(is_seen, out.opacities, rows, 0, opacity)
-    _scatter_seen(is_seen, out.radii, rows, 0, rx)
-    _scatter_seen(is_seen, out.radii, rows, 1, ry)
-    _scatter_seen(is_seen, out.boxes, rows, 0, x0)
-    _scatter_seen(is_seen, out.boxes, rows, 1, y0)
-    _scatter_seen(is_seen, out.boxes, rows, 2, x1)
-    _scatter_seen(is_seen, out.boxes, rows, 3, y1)
+    reach = rx, ry, x0, y0, x1, y1
+    is_drawn = is_seen(p[2], opacity, footprint, (a, b, c), reach, extent.alpha_min, constants)
+    _scatter_seen(is_drawn, out.means2d, rows, 0, footprint.x)
+    _scatter_seen(is_drawn, out.means2d, rows, 1, footprint.y)
+    _scatter_seen(is_drawn, out.depths, rows, 0, p[2])
+    _scatter_seen(is_drawn, out.conics, rows, 0, a)
+    _scatter_seen(is_drawn, out.conics, rows, 1, b)
+    _scatter_seen(is_drawn, out.conics, rows, 2, c)
+    _scatter_seen(is_drawn, out.opacities, rows, 0, opacity)
+    _scatter_seen(is_drawn, out.radii, rows, 0, rx)
+    _scatter_seen(is_drawn, out.radii, rows, 1, ry)
+    _scatter_seen(is_drawn, out.boxes, rows, 0, x0)
+    _scatter_seen(is_drawn, out.boxes, rows, 1, y0)
+    _scatter_seen(is_drawn, out.boxes, rows, 2, x1)
+    _scatter_seen(is_drawn, out.boxes, rows, 3, y1)
 
 
 @scalar
-def _scatter_seen(is_seen, table, rows, column, lanes):
+def _scatter_seen(is_drawn, table, rows, column, lanes):
     """Write lanes to a column, with zeros where a Gaussian is culled."""
-    scatter(table, rows, column, select(is_seen, lanes, ZERO))
+    scatter(table, rows, column, select(is_drawn, lanes, ZERO))
 
 
 @kernel()

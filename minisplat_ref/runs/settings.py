@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref import __version__
-from minisplat_ref.backends import BACKENDS
+from minisplat_ref.backends import BACKENDS, CUDA
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
@@ -217,7 +217,7 @@ def load(folder: Path) -> Settings:
     if not wrong:
         texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
         wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
-        wrong += ["backend"] * (settings.backend not in BACKENDS)
+        wrong += ["backend"] * (settings.backend not in (*BACKENDS, CUDA))
         wrong += ["background"] * (settings.background is not None and as_array(settings.background, (3,)) is None)
     if wrong:
         name = wrong[0]

@@ -58,6 +58,12 @@ def conic_vjp_of_moments(slope, ee, ey, yy):
 
 
 @scalar
+def mean_vjp_of_moments(a, slope, pivot, qe, qy):
+    """Return the gradient with respect to the image position, given sums of dL/dsigma times e and dy."""
+    return a * qe, slope * a * qe + pivot * qy
+
+
+@scalar
 def blend(transmittance, unclamped, frame):
     """Blend one hit.
 

@@ -63,3 +63,13 @@ def inria_box(footprint, width, height):
     y0, y1 = inria_tiles(footprint.y - HALF, r, height)
     r = minimum(r, RADIUS_MAX)
     return r, r, x0, y0, x1, y1
+
+
+@scalar
+def is_seen(z, opacity, footprint, conic, reach, alpha_min, constants):
+    """Return whether a Gaussian is not culled, given conic (a, b, c) and reach (radii, box)."""
+    rx, ry, x0, y0, x1, y1 = reach
+    is_between = (z > constants.near) & (z < constants.far) & (opacity >= alpha_min) & (footprint.det > ZERO)
+    # Finite if all of them are.
+    size = footprint.det + abs(conic[0]) + abs(conic[2]) + abs(footprint.x) + abs(footprint.y)
+    return is_between & (size < np.inf) & (rx > ZERO) & (ry > ZERO) & (x1 > x0) & (y1 > y0)

@@ -189,3 +189,9 @@ PROFILE_GRID = 5e-3
 # The image with and without a Gaussian, in float64: the difference has the rounding of both, 1e-16 for each of a few
 # hits, relative to pixels of the order of one, of which a thousand are squared and summed.
 REMOVAL = 1e-10
+
+# One image by the CUDA kernels in float32, as promised: expf has an error of 2e-7, and sums have hundreds of hits.
+CUDA_FLOAT32_IMAGE = 2e-5
+
+# Gradients by the CUDA kernels in float32, as promised, relative to the largest; measured 1.3e-6 in the simulator.
+CUDA_FLOAT32_GRADIENT = 1e-4

@@ -13,7 +13,7 @@ from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, load, store
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors
+from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors, mean_vjp_of_moments
 
 N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
 N_PAIR_STATS = 3  # sum of the weights, largest weight, number of hits
@@ -34,8 +34,7 @@ def _sum_slots(n, slots, width, first, end, sums, projection, out):
     store(sums, 0, total)
     sums[WIDTH] = blue
     a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
-    out.means2d[n, 0] = a * sums[1]
-    out.means2d[n, 1] = slope * a * sums[1] + pivot * sums[2]
+    out.means2d[n, 0], out.means2d[n, 1] = mean_vjp_of_moments(a, slope, pivot, sums[1], sums[2])
     v_a, v_b, v_c = conic_vjp_of_moments(slope, sums[3], sums[4], sums[5])
     out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = v_a, v_b, v_c
     out.opacities[n] = -sums[0] / projection.opacities[n]

@@ -12,6 +12,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
+from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, lowest_bit, reduce_any, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
@@ -59,7 +60,18 @@ class Pixels(NamedTuple):
 
 
 def lists_of(bins: TileBins) -> TileLists:
-    """Return the lists without their grid."""
+    """Return the lists without their grid.
+
+    Raises
+    ------
+    InputError
+        Their tiles have another size than the kernels have.
+    """
+    if (bins.grid.tile_width, bins.grid.tile_height) != (TILE_WIDTH, TILE_HEIGHT):
+        raise InputError(
+            f"these kernels of the CPU blend tiles of {TILE_WIDTH} x {TILE_HEIGHT} pixels, not of"
+            f" {bins.grid.tile_width} x {bins.grid.tile_height}: choose the backend cpu for all stages"
+        )
     return TileLists(bins.tile_offsets, bins.gaussian_ids, bins.slots)
 
 

@@ -1,0 +1,39 @@
+"""The record of a Gaussian that blending kernels read: ten numbers and its colours, in the data's dtype.
+
+Conics are float64; their factors are computed here, once for each Gaussian, so that blending needs no float64.
+"""
+
+from typing import Any
+
+from minisplat_ref.cuda.arrays import empty, to_device
+from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
+from minisplat_ref.jit.literals import HALF
+from minisplat_ref.scalar.compositing import factors
+from minisplat_ref.types import Floats, Projection
+
+# Columns. The conic is stored as its factors, two of them halved as sigma needs them; edges of the box are floats.
+MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY, X0, Y0, X1, Y1, COLOR = range(11)
+
+
+@gpu_kernel
+def write_records(projection, colors, records):
+    """Write the record of one Gaussian."""
+    n = cuda.grid(1)
+    if n >= records.shape[0] or projection.radii[n, 0] == 0:
+        return
+    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
+    records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], projection.means2d[n, 1]
+    records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT] = HALF * a, slope, HALF * pivot
+    records[n, OPACITY] = projection.opacities[n]
+    for i in range(4):
+        records[n, X0 + i] = projection.boxes[n, i]
+    for k in range(colors.shape[1]):
+        records[n, COLOR + k] = colors[n, k]
+
+
+def records_of(projection: Projection, colors: Floats) -> Any:
+    """Return the records [N, 10 + D] on the device; those of culled Gaussians are undefined."""
+    n, n_channels = colors.shape
+    records = empty((n, COLOR + n_channels), colors.dtype)
+    launch_rows(write_records, n, to_device(projection), to_device(colors), records)
+    return records

@@ -1,0 +1,65 @@
+"""A tile is a block of 256 threads, one for each pixel. Batches of its list are read into shared memory."""
+
+from typing import NamedTuple
+
+from minisplat_ref.cuda.compositing.records import HALF_A, HALF_PIVOT, MEAN_X, MEAN_Y, OPACITY, SLOPE, X0, X1, Y0, Y1
+from minisplat_ref.cuda.target import WARP, cuda, device_function
+from minisplat_ref.cuda.tiling import TILE
+from minisplat_ref.jit.lanes import exp_of, select
+from minisplat_ref.jit.literals import ZERO
+from minisplat_ref.scalar.compositing import mahalanobis
+from minisplat_ref.types import Floats, Ints
+
+BLOCK = TILE * TILE
+N_WARPS = BLOCK // WARP
+BATCH = 32  # Gaussians in shared memory
+
+
+class Lists(NamedTuple):
+    """The tiles' lists as kernels read them; see :class:`~minisplat_ref.types.TileBins`."""
+
+    offsets: Ints
+    """[n_tiles + 1] tile t owns the pairs [offsets[t], offsets[t + 1])."""
+    ids: Ints
+    """[M] Gaussian of each pair."""
+    slots: Ints
+    """[M] slot of each pair."""
+
+
+class Pixels(NamedTuple):
+    """All pixels of the image, or the gradient with respect to them."""
+
+    image: Floats
+    """[H, W, D]."""
+    alpha: Floats
+    """[H, W]."""
+
+
+@device_function
+def pixel_of(frame):
+    """Return column and line of the thread's pixel, which may lie beyond the image's edge."""
+    tile, thread = cuda.blockIdx.x, cuda.threadIdx.x
+    n_tiles_x = (frame.width + TILE - 1) // TILE
+    return tile % n_tiles_x * TILE + thread % TILE, tile // n_tiles_x * TILE + thread // TILE
+
+
+@device_function
+def read_batch(records, ids, first, n_listed, n_fields, batch):
+    """Read up to ``BATCH`` records of the pairs from ``first`` on; all threads of the block call it."""
+    cuda.syncthreads()  # all have finished with the batch before
+    for i in range(cuda.threadIdx.x, n_listed * n_fields, BLOCK):
+        j = i // n_fields
+        batch[j, i - j * n_fields] = records[ids[first + j], i - j * n_fields]
+    cuda.syncthreads()
+
+
+@device_function
+def hit(batch, j, center_x, center_y):
+    """Return alpha before its clamp at a pixel's centre, and e = dx + slope dy and dy."""
+    dy = batch[j, MEAN_Y] - center_y
+    e = batch[j, MEAN_X] - center_x + batch[j, SLOPE] * dy
+    sigma = mahalanobis(e, batch[j, HALF_A], batch[j, HALF_PIVOT] * dy * dy)
+    is_inside = (
+        (batch[j, X0] < center_x) & (center_x < batch[j, X1]) & (batch[j, Y0] < center_y) & (center_y < batch[j, Y1])
+    )
+    return select(is_inside, batch[j, OPACITY] * exp_of(-sigma), ZERO), e, dy

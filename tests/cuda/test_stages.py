@@ -1,0 +1,96 @@
+"""The backend cuda against the reference: the kernels run in Numba's simulator, in a process of its own."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuda_stages import CASES, run_stages
+from minisplat_ref.backends import REFERENCE
+from tolerances import (
+    CUDA_FLOAT32_GRADIENT,
+    CUDA_FLOAT32_IMAGE,
+    PARITY_FLOAT32_PROJECTION,
+    PARITY_FLOAT64,
+)
+
+pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
+
+HELPERS = Path(__file__).parent.parent / "helpers"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """What the stages return in the simulator, by case, and the gradient of blending in a second run."""
+    path = tmp_path_factory.mktemp("cuda") / "results.pickle"
+    places = os.pathsep.join([str(HELPERS), str(HELPERS.parent.parent), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
+    subprocess.run([sys.executable, HELPERS / "cuda_stages.py", path], env=environment, check=True)
+    return pickle.loads(path.read_bytes())
+
+
+def assert_close(found, expected, tolerance, name):
+    """Every array within a tolerance relative to the largest value, and integers equal."""
+    for field, x, y in zip(found._fields, found, expected, strict=True):
+        if y is None or isinstance(y, (dict, int)):
+            continue
+        if isinstance(y, tuple):
+            assert_close(x, y, tolerance, f"{name}.{field}")
+            continue
+        assert x.shape == y.shape, f"{name}.{field}"
+        if y.dtype.kind == "i":
+            assert np.array_equal(x, y) and x.dtype == y.dtype, f"{name}.{field}"
+        elif y.size:
+            error = np.max(np.abs(x - y)) / max(np.max(np.abs(y)), 1e-300)
+            assert error <= tolerance, f"{name}.{field}: {error}"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_stage_is_that_of_the_reference(simulated, name):
+    case, found = CASES[name], simulated[0][name]
+    expected = run_stages(case, REFERENCE, np.float64, found)
+    is_wide = case.dtype == np.float64
+    one, image, gradient = (
+        (PARITY_FLOAT64,) * 3 if is_wide else (PARITY_FLOAT32_PROJECTION, CUDA_FLOAT32_IMAGE, CUDA_FLOAT32_GRADIENT)
+    )
+    assert_close(found["projection"], expected["projection"], one, "projection")
+    assert_close(found["projection_vjp"], expected["projection_vjp"], gradient, "projection_vjp")
+    assert found["colors"].dtype == case.dtype
+    np.testing.assert_allclose(found["colors"], expected["colors"], atol=one)
+    assert_close(found["colors_vjp"], expected["colors_vjp"], gradient, "colors_vjp")
+    assert_close(found["output"], expected["output"], image, "output")
+    assert_close(found["plain_output"], expected["plain_output"], image, "plain_output")
+    assert_close(found["output_vjp"], expected["output_vjp"], gradient, "output_vjp")
+    assert {x.dtype for x in found["output_vjp"]} <= {np.dtype(case.dtype), np.dtype(np.float64)}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_lists_are_those_of_the_reference_byte_for_byte(simulated, name):
+    found = simulated[0][name]
+    expected = run_stages(CASES[name], REFERENCE, np.float64, found)["bins"]
+    for x, y in zip(found["bins"][:4], expected[:4], strict=True):
+        assert (x.dtype, x.tobytes()) == (y.dtype, y.tobytes())
+    assert found["bins"].grid == expected.grid
+
+
+def test_the_cases_reach_what_they_are_for(simulated):
+    results = simulated[0]
+    assert len(results["four tiles"]["bins"].tile_offsets) - 1 == 4
+    assert np.all(results["four tiles"]["projection"].radii[:2] == 0)
+    for name in ("two batches", "opaque"):
+        assert np.max(np.diff(results[name]["bins"].tile_offsets)) > 32  # Gaussians that are read at once
+    late = results["two batches"]["bins"].gaussian_ids[33:]
+    assert np.any(results["two batches"]["output"].stats.hit_count[late] > 0)
+    hidden = results["opaque"]["bins"].gaussian_ids[32:]  # every pixel is finished, and so is the block
+    assert np.all(results["opaque"]["projection"].opacities[hidden] > 0.9)
+    assert np.all(results["opaque"]["output"].stats.hit_count[hidden] == 0)
+    assert np.any(results["four tiles"]["output"].median_depth > 0)
+
+
+def test_a_second_run_gives_the_same_bytes(simulated):
+    for x, y in zip(simulated[0]["four tiles"]["output_vjp"], simulated[1], strict=True):
+        assert x.tobytes() == y.tobytes()
