@@ -33,6 +33,7 @@ from . import (
     evaluate,
     extensions,
     info,
+    mesh,
     oracle,
     photos,
     render,
@@ -47,7 +48,7 @@ from . import (
 GROUPS = {
     "start here": (demo, photos),
     "preparing scenes": (sfm, undistort, downscale, synthetic),
-    "training and its results": (train, render, evaluate, simplify, convert, compare, info),
+    "training and its results": (train, render, evaluate, simplify, mesh, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
     "the program itself": (extensions, cache),
 }

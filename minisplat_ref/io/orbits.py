@@ -107,7 +107,7 @@ def _path_of_cameras(cameras: Sequence[Camera], width: int) -> _Path:
     rotations = np.array([camera.cam_from_world_R for camera in cameras])  # [V, 3, 3]
     centres = np.array([camera.center for camera in cameras])  # [V, 3]
     forwards = rotations[:, 2]  # [V, 3]
-    target = _nearest_to_axes(centres, forwards)
+    target = nearest_to_axes(centres, forwards)
     up = _up(rotations)
     heights = (centres - target) @ up  # [V]
     radial = centres - target - heights[:, None] * up  # [V, 3]
@@ -124,7 +124,7 @@ def _path_of_cameras(cameras: Sequence[Camera], width: int) -> _Path:
     return _Path(target, up, start, angles, places, directions, _find_covered(angles), focal)
 
 
-def _nearest_to_axes(centres: Floats, forwards: Floats) -> Floats:
+def nearest_to_axes(centres: Floats, forwards: Floats) -> Floats:
     """Return the point nearest to all optical axes; for parallel ones, a point in front of the cameras."""
     # The minimum solves sum (I - d d^T)(x - c) = 0; the damping keeps parallel axes solvable.
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]

@@ -18,7 +18,7 @@ from minisplat_ref.training.losses import LossTerm, photometric
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.schedule import At, During, Every, Recipe
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
-from minisplat_ref.types import Gaussians
+from minisplat_ref.types import Floats, Gaussians
 
 
 def collect_gradients(state: TrainState, iteration: Iteration) -> None:
@@ -85,8 +85,12 @@ def prune_large(state: TrainState, iteration: Iteration, *, size_fraction: float
 
 def reset_opacity(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
     """Lower all opacities to at most ``ceiling`` and forget their moments, which point back up."""
-    logits = clone_split.cap_opacity_logits(state.gaussians.opacity_logits, ceiling=ceiling)
-    state.gaussians = state.gaussians._replace(opacity_logits=logits)
+    lower_opacities(state, clone_split.cap_opacity_logits(state.gaussians.opacity_logits, ceiling=ceiling))
+
+
+def lower_opacities(state: TrainState, opacity_logits: Floats) -> None:
+    """Set the logits [N] of the opacities and forget their moments."""
+    state.gaussians = state.gaussians._replace(opacity_logits=opacity_logits)
     for moment in (state.adam.first, state.adam.second):
         moment.opacity_logits[:] = 0
 

@@ -7,6 +7,7 @@
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
 :data:`MAX_DROP`            :mod:`..runs.max_drop_study`: what ``simplify --max-drop`` promises, and what it keeps
+:data:`MESH`                :mod:`..runs.mesh_study`: meshes of runs against the exact surface of synthetic scenes
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians start again
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
@@ -19,7 +20,7 @@ imported when a study runs. :mod:`.study`, :mod:`.kit` and :mod:`.figures` have 
 extensions, and :mod:`.conditions` how they disturb a scene.
 """
 
-from minisplat_ref.arguments import SYNTHETIC_SCENES, decibels, fraction, list_of, name
+from minisplat_ref.arguments import decibels, fraction, list_of, name
 from minisplat_ref.studies.study import (
     CONTINUES,
     OUT,
@@ -37,6 +38,7 @@ from minisplat_ref.studies.study import (
     one_of,
     recipe,
     seed,
+    synthetic_scene,
 )
 
 CONDITION_HELP = (
@@ -45,7 +47,7 @@ CONDITION_HELP = (
 )
 _CONDITION = argument("--condition", type=name, default="whole", metavar="C", help=f"{CONDITION_HELP} (default whole)")
 _RESUMED_SCENE = (SCENE, RESUMED_OUT, downscale())
-_SYNTHETIC_SCENE = argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
+_SYNTHETIC_SCENE = synthetic_scene()
 _CALIBRATION = (
     _SYNTHETIC_SCENE,
     OUT,
@@ -58,7 +60,7 @@ _CALIBRATION = (
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that users type; an extension's are EXTENSION/NAME."""
-    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, MAX_DROP, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
+    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, MAX_DROP, MESH, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
     return {each.name: each for each in studies}
 
 
@@ -180,6 +182,22 @@ MAX_DROP = declare(
     _CONDITION,
     SEEDS,
     description=f"Train a scene, simplify to each limit, and measure what test views lose. {CONTINUES}",
+)
+MESH = declare(
+    "mesh",
+    "meshes of runs against the exact surface of a synthetic scene",
+    "minisplat_ref.runs.mesh_study.run",  # which makes meshes of runs, and so is above this layer
+    _SYNTHETIC_SCENE,
+    RESUMED_OUT,
+    argument(
+        "--recipes",
+        type=list_of(name),
+        default=("3dgs-accel", "mini-splatting2", "adaptive"),
+        metavar="R,Q",
+        help="names as in train --recipe (default 3dgs-accel,mini-splatting2,adaptive)",
+    ),
+    iterations(2000),
+    SEEDS,
 )
 DEPTH = declare(
     "depth",

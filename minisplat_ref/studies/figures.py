@@ -61,11 +61,6 @@ def with_deviation(values: Sequence[float], digits: int) -> str:
     return plus_minus(mean_and_deviation(values)[: min(len(values), 2)], digits)
 
 
-def with_range(values: Sequence[float], digits: int) -> str:
-    """Return the mean and half the range as text for a table."""
-    return plus_minus((float(np.mean(values)), float(np.ptp(values)) / 2), digits)
-
-
 def table_of(corner: str, rows: Mapping[Any, Mapping[Any, float | None]], form: str = ".1e", unit: str = "") -> str:
     """Return a table in Markdown of numbers by row and column; what is None has no meaning."""
     heading = [f"{column}{unit}" for column in next(iter(rows.values()))]
@@ -100,10 +95,11 @@ def plot_deviations(axes: "Axes", x: Any, by_seed: Iterable[Sequence[float]], **
     axes.errorbar(x, means, yerr=deviations, **{"fmt": "-o", "ms": 4, "capsize": 3, **style})
 
 
-def plot_range(axes: "Axes", x: Sequence[float], values: Floats, color: str, label: str) -> None:
-    """Plot the mean of values [seeds, X] over x as a line, and their range as a band."""
-    axes.fill_between(x, values.min(axis=0), values.max(axis=0), color=color, alpha=0.25, lw=0)
-    axes.plot(x, values.mean(axis=0), "o-", ms=4, color=color, label=label)
+def plot_band(axes: "Axes", x: Sequence[float], values: Floats, color: str, label: str) -> None:
+    """Plot the mean of values [seeds, X] over x as a line, and a deviation to either side as a band."""
+    means, deviations = np.transpose([mean_and_deviation(of_seeds) for of_seeds in values.T])
+    axes.fill_between(x, means - deviations, means + deviations, color=color, alpha=0.25, lw=0)
+    axes.plot(x, means, "o-", ms=4, color=color, label=label)
 
 
 def set_ticks(axes: "Axes", ticks: Sequence[float], labels: Sequence[str]) -> None:

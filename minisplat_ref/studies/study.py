@@ -93,6 +93,11 @@ def scene(default: str | None = None) -> Argument:
     return argument("scene", nargs="?", default=default, metavar="SCENE", help=f"{meaning} (default {default})")
 
 
+def synthetic_scene() -> Argument:
+    """Return the name of a synthetic scene."""
+    return argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
+
+
 def downscale(default: int = 1) -> Argument:
     """Return ``--downscale`` of a folder's photographs."""
     return number("--downscale", default, "make photographs D times smaller", metavar="D")

@@ -1,6 +1,7 @@
 """Anti-aliasing: sampling intervals, the 3D filter and its gradient, where it is 3DGS, training end to end."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,7 +23,10 @@ from minisplat_ref.extensions.antialiasing.method import (
     MIP,
     FilteredGaussians,
     add_filters,
+    apply_filters,
     measure_filters,
+    reset_smoothed_opacity,
+    reset_smoothed_opacity_on_white,
     with_3d_filter,
 )
 from minisplat_ref.extensions.antialiasing.reference import smooth, smooth_vjp
@@ -33,7 +37,7 @@ from minisplat_ref.methods.gaussian_splatting import clone_and_split
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
-from minisplat_ref.training.schedule import does, firing_steps, scale_recipe
+from minisplat_ref.training.schedule import At, does, firing_steps, scale_recipe
 from minisplat_ref.types import Gaussians, Model, View, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT64, ROUNDED_TO_FLOAT32
@@ -139,6 +143,37 @@ def test_filters_are_measured_at_once_every_hundred_iterations_and_after_each_de
         grows = firing_steps(recipe, clone_and_split)
         last = {step: [event for event in recipe.events if event.is_due(step)][-1] for step in grows}
         assert len(grows) > 10 and all(does(event, measure_filters) for event in last.values())
+
+
+def test_a_reset_lowers_what_is_seen():
+    """A filter of the ball's own size leaves an opacity of o / 2^1.5 of it; capped at 0.01 it is 0.0282843 in itself.
+
+    A ball with an eighth of the filter's size is too faint to be capped: ``65^-1.5`` of its opacity is 0.0019.
+    """
+    filtered = with_filters(
+        balls(np.zeros((4, 3)), [0.1, 0.1, 0.1, 0.0125], [0.9, 0.9, 0.02, 0.9]), [0.0, 0.1, 0.1, 0.1]
+    )
+    state = state_of(filtered)
+    reset = ANTIALIASING._replace(events=(At(1, partial(reset_smoothed_opacity, ceiling=0.01)),))
+    state.adam.first.opacity_logits[:] = 1.0
+    act(reset, reset_smoothed_opacity, state, scene_of([turned_camera()]))
+    opacities = 1 / (1 + np.exp(-state.gaussians.opacity_logits))
+    assert_allclose(opacities, [0.01, 0.02828427, 0.02, 0.9], rtol=1e-6)
+    seen = 1 / (1 + np.exp(-apply_filters(state.gaussians).opacity_logits))
+    assert_allclose(seen, [0.01, 0.01, 0.02 / 2**1.5, 0.9 * 65**-1.5], rtol=1e-6)
+    assert not state.adam.first.opacity_logits.any()
+
+
+def test_resets_come_as_in_3dgs():
+    """Every 3,000 iterations until 12,000, and once early on a white background."""
+    assert firing_steps(ANTIALIASING, reset_smoothed_opacity) == [3000, 6000, 9000, 12_000]
+    assert firing_steps(ANTIALIASING, reset_smoothed_opacity_on_white) == [500]
+    for white, capped in ((1.0, 0.01), (0.5, 0.9)):
+        state = state_of(with_filters(balls(np.zeros((1, 3)), [0.1], [0.9]), [0.0]))
+        scene = scene_of([turned_camera()])._replace(background=np.full(3, white))
+        event = At(1, partial(reset_smoothed_opacity_on_white, ceiling=0.01))
+        act(ANTIALIASING._replace(events=(event,)), reset_smoothed_opacity_on_white, state, scene)
+        assert_allclose(1 / (1 + np.exp(-state.gaussians.opacity_logits)), capped, rtol=1e-6)
 
 
 def test_the_blur_is_a_tenth_of_a_squared_pixel_and_keeps_the_light():
@@ -299,7 +334,16 @@ def test_the_study_measures_all_recipes(tmp_path, capsys):
     assert main(["study", "antialiasing/zoom", *options]) == 0
     result = json.loads((out / "result.json").read_text())
     assert result["zooms"] == [0.25, 0.5, 1.0, 2.0]
-    assert result["psnr"]["antialiasing"][0][0] > result["psnr"]["3dgs-accel"][0][0]  # from far
+    psnr = {name: seeds[0] for name, seeds in result["psnr"].items()}
+    assert [name for name in psnr if "," not in name] == [
+        "3dgs-accel",
+        "3D filter alone",
+        "2D filter alone",
+        "antialiasing",
+        "analytic",
+    ]
+    assert psnr["antialiasing"][0] > psnr["3dgs-accel"][0]  # from far
+    assert len({tuple(values) for values in psnr.values()}) == len(psnr) == 8
     assert (out / "figure.png").stat().st_size > 10_000 and "| analytic " in capsys.readouterr().out
     assert main(["study", "antialiasing/zoom", "nowhere", "--out", str(tmp_path / "none")]) == 2
     assert "neither a folder nor one of" in capsys.readouterr().err and not (tmp_path / "none").exists()

@@ -15,6 +15,7 @@ from minisplat_ref.mechanisms.meshes.fans import (
     opacity_radii,
     plane_axes,
     rims,
+    turn_balls,
 )
 from scenes import make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
@@ -48,6 +49,20 @@ def test_a_polygon_by_hand():
     corners = rims(flat.means, flat.spans, np.array([radius]))
     assert_allclose(corners[0], expected, rtol=CLOSED_FORM, atol=CLOSED_FORM)
     assert_allclose(flat.axes[0, :, 2], [1, 0, 0], atol=CLOSED_FORM)
+
+
+def test_balls_become_flat_in_all_directions(rng):
+    """The mean of n n^T over directions n that spread evenly is a third of the identity; others stay."""
+    g = make_gaussians(rng, 3000)
+    shaped = g.log_scales[:1000].copy()
+    g.log_scales[1000:] = -2.0
+    g.quats[1000:] = [1.0, 0, 0, 0]
+    turned = turn_balls(g, rng)
+    normals = flat_of(turned).axes[1000:, :, 2]
+    assert_allclose(normals.T @ normals / 2000, np.eye(3) / 3, atol=0.05)  # seven standard deviations
+    assert_array_equal(turned.quats[:1000], g.quats[:1000])
+    assert_array_equal(turned.log_scales[:1000], shaped)
+    assert (g.quats[1000:] == [1, 0, 0, 0]).all()  # what was given is not changed
 
 
 def test_alpha_is_the_same_at_every_corner(rng):

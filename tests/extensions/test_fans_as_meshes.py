@@ -441,5 +441,19 @@ def test_the_studies(scene_folder, model, tmp_path, capsys, monkeypatch):
     assert "| 8     | 2.50  | 0.00 | 12.3%     | 0.94 |" in capsys.readouterr().out
 
 
+def test_fans_of_sparse_points_face_everywhere(rng):
+    """Points are balls at first; no direction sees more than a few of their fans edge on."""
+    balls = make_gaussians(rng, 500)._replace(
+        log_scales=np.full((500, 3), -3.0), quats=np.tile([1.0, 0, 0, 0], (500, 1))
+    )
+    fans = FANS_OF_GAUSSIANS.extend(balls, rng)
+    spans = fans.rims[:, 0, [0, 2]] - fans.means[:, None]  # [N, 2, 3] of eight sides, a quarter of a turn apart
+    normals = np.cross(spans[:, 0], spans[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for direction in np.eye(3):
+        # |n . d| of evenly spread normals is uniform in [0, 1].
+        assert np.quantile(np.abs(normals @ direction), [0.25, 0.5, 0.75]) == pytest.approx([0.25, 0.5, 0.75], abs=0.1)
+
+
 def test_its_representation_draws_fans():
     assert FANS_OF_GAUSSIANS.renderer.channels(frozenset({"depth"})) == {"rgb": slice(0, 3)}

@@ -15,12 +15,14 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
+from minisplat_ref.extensions.micro.counts import ARMS
 from minisplat_ref.extensions.micro.method import (
     clone_and_split_by_detail,
     clusters,
     halve_children,
     halve_large,
     merge_alike,
+    prune_least,
 )
 from minisplat_ref.extensions.micro.reference import (
     are_alike,
@@ -44,7 +46,7 @@ from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, SAMPLE_MEAN
 
-OFF = {"trace": 0.0, "beta": 0.0, "merge_reach": 0.0}
+OFF = {"trace": 0.0, "beta": 0.0, "score_mass": 1.0, "merge_reach": 0.0}
 
 
 def balls(centres, sizes, colors=None):
@@ -211,6 +213,24 @@ def test_the_recipe_merges_within_a_size_and_a_tenth_of_a_colour(distance, color
     assert note == (None if is_merged else "nothing done: no two neighbours are alike")
 
 
+def test_the_recipe_removes_a_hundredth_of_opacity_times_size():
+    """Of four balls of one opacity the two of size 0.5 and 0.4 have 0.9 % of the sum of the sizes, 100."""
+    state = state_of(balls(np.zeros((4, 3)), [0.5, 60.0, 39.1, 0.4]))
+    act(find_recipe("micro"), prune_least, state, scene_of())
+    assert_allclose(np.exp(state.gaussians.log_scales[:, 0]), [60.0, 39.1])
+    faint = balls(np.zeros((3, 3)), [1.0, 1.0, 1.0])._replace(opacity_logits=np.array([4.0, -6.0, 4.0]))
+    state = state_of(faint)  # opacities of 0.982, 0.0025 and 0.982
+    act(find_recipe("micro"), prune_least, state, scene_of())
+    assert_array_equal(state.gaussians.opacity_logits, [4.0, 4.0])
+
+
+@pytest.mark.parametrize(("mass", "size"), [(1.0, 1e-9), (0.99, np.inf)])
+def test_nothing_is_removed_where_all_count_or_a_size_is_infinite(mass, size):
+    state = state_of(balls(np.zeros((3, 3)), [1.0, 1.0, size]))
+    note = prune_least(state, None, score_mass=mass)
+    assert note == "nothing done: all are kept" and len(state.gaussians.means) == 3
+
+
 # --- where it is 3DGS ---
 
 
@@ -251,8 +271,8 @@ def test_switched_off_it_is_3dgs_to_the_byte(backend, rng):
             assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
 
 
-@pytest.mark.parametrize(("name", "value"), [("trace", 1e-3), ("beta", 0.5), ("merge_reach", 1.0)])
-def test_each_of_the_three_changes_something(name, value, rng):
+@pytest.mark.parametrize(("name", "value"), [("trace", 1e-3), ("beta", 0.5), ("score_mass", 0.9), ("merge_reach", 1.0)])
+def test_each_of_the_four_changes_something(name, value, rng):
     scene = tiny_scene(rng)
     settings = {**OFF, name: value, "trace_limit": 0.2, "merge_color": 1.0}
     changed, plain = (
@@ -262,13 +282,13 @@ def test_each_of_the_three_changes_something(name, value, rng):
     assert changed.gaussians.means.tobytes() != plain.gaussians.means.tobytes()
     if name == "trace":
         assert traces(changed.gaussians.log_scales).max() < traces(plain.gaussians.log_scales).max()
-    if name == "merge_reach":
+    if name in ("score_mass", "merge_reach"):
         assert len(changed.gaussians.means) < len(plain.gaussians.means)
 
 
-def test_the_recipe_is_that_of_3dgs_with_one_event_changed_and_three_more():
+def test_the_recipe_is_that_of_3dgs_with_one_event_changed_and_four_more():
     ours, theirs = find_recipe("micro"), find_recipe("3dgs-accel")
-    assert len(ours.events) == len(theirs.events) + 3
+    assert len(ours.events) == len(theirs.events) + 4
     assert sum(does(event, clone_and_split_by_detail) for event in ours.events) == 1
     assert all(isinstance(event.action, partial) or isinstance(event, During) for event in ours.events)
 
@@ -296,7 +316,7 @@ def run_folder(scene_folder, tmp_path_factory):
 def test_it_trains_and_says_what_it_did(run_folder, capsys):
     fired = [json.loads(line) for line in (run_folder / "events.jsonl").read_text().splitlines()]
     actions = {record["action"] for record in fired}
-    assert {"clone_and_split_by_detail", "halve_large", "merge_alike"} <= actions
+    assert {"clone_and_split_by_detail", "halve_large", "prune_least", "merge_alike"} <= actions
     metrics = json.loads((run_folder / "metrics.json").read_text())
     assert metrics["psnr"] > 10
     assert main(["eval", str(run_folder)]) == 0
@@ -343,3 +363,13 @@ def test_the_study_measures_at_equal_count(tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["study", "micro/checker", "--seeds", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()
+
+
+def test_the_study_measures_quality_against_count(scene_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("minisplat_ref.extensions.micro.counts.ARMS", {k: v[:1] for k, v in ARMS.items()})
+    out = tmp_path / "counts"
+    options = ["--iterations", "300", "--seeds", "1", "--out", str(out)]
+    assert main(["study", "micro/counts", str(scene_folder), *options]) == 0
+    plain, first, both = json.loads((out / "result.json").read_text())["points"]
+    assert both["n_gaussians"][0] < first["n_gaussians"][0] and plain["settings"] == {"threshold": 2e-4}
+    assert (out / "figure.png").stat().st_size > 10_000 and "| micro, first stage alone | " in capsys.readouterr().out

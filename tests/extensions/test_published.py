@@ -220,6 +220,9 @@ MICRO = {
         merge_alike=[steps(15_000, 24_000, 1_000)],
         merge_alike__merge_reach=1.0,
         merge_alike__merge_color=0.1,
+        prune_least=[steps(15_000, 24_000, 1_000)],
+        prune_least__score_mass=0.99,
+        prune_least__min_gap=100,
     ),
 }
 
@@ -254,7 +257,7 @@ TABLES = {
     "mini-splatting2": MINI_SPLATTING2,
     "mini-splatting2-d": MINI_SPLATTING2_D,
     "analytic": GS_ACCEL,
-    "antialiasing": GS_ACCEL
+    "antialiasing": {name.replace("reset_opacity", "reset_smoothed_opacity"): row for name, row in GS_ACCEL.items()}
     | rows(
         "Mip-Splatting, equations (7) to (9) and released code",
         measure_filters=[[1], steps(100, 30_000, 100)],

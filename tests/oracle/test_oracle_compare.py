@@ -183,6 +183,7 @@ def test_lists_are_compared_as_sets_and_in_their_order(ordinary):
     backwards[: offsets[1]] = ids[: offsets[1]][::-1]
     assert status(backwards).status == "diverges" and "1 tiles in another order" in status(backwards).note
     assert status(ids[1:], np.append(0, offsets[1:] - 1)).note.startswith("1 pairs fewer")
+    assert "no lists" in status(ids, np.append(1, offsets[1:])).note  # a pair that is in no list
     assert "no lists" in status(ids, offsets[:-1]).note and "no lists" in status(ids + 1000).note
     doubled = np.append(ids[:1], ids)
     assert status(doubled, np.append(0, offsets[1:] + 1)).status == "diverges"

@@ -14,6 +14,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import extension as extension_module
 from minisplat_ref.extensions.compression import levels, msz, spz
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
+from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.runs import conversion
@@ -59,6 +60,20 @@ def test_a_drop_that_is_rounding_is_none():
         return 30.0 - 2e-7 if is_exact else 29.9
 
     assert conversion.coarsest_within(gaussians, msz.MSZ, 0.0, psnr_of).level == 0
+
+
+@pytest.mark.parametrize(("max_drop", "level"), [(0.05, 2), (0.0499, 1), (0.01, 1), (0.00998, 0), (0.0, 0)])
+def test_no_more_is_lost_than_was_allowed(max_drop, level):
+    """Three levels lose 0, 0.01 and 0.05 dB."""
+    losses = (0.0, 0.01, 0.05)
+    decode = {str(k).encode(): object() for k in range(3)}
+    psnr_of = {id(found): 30.0 - loss for found, loss in zip(decode.values(), losses, strict=True)}
+    whole = population(1)
+    format_ = Format(
+        ".x", "", ("",) * 3, 0, lambda _, k: str(k).encode(), lambda content, _: decode[content], lambda *_: []
+    )
+    choice = conversion.coarsest_within(whole, format_, max_drop, lambda g: psnr_of.get(id(g), 30.0))
+    assert choice.level == level and choice.drop == pytest.approx(losses[level])
 
 
 # Formats are found by their suffixes

@@ -216,6 +216,15 @@ def test_unimportant_ones_merge_first():
     assert_array_equal(merge_neighbours(gaussians, np.array([1, 1, 1, 0.5]), 3).is_new, [True, False, False])
 
 
+def test_what_is_merged_counts_by_the_lighter_of_two():
+    """Ward: 100 / 101 for the gap of 1 beside a heavy one, against 2 * 2 / 4 * 1.5 for that of sqrt(1.5).
+
+    The product of the weights alone, 100 against 6, or the heavier weight, would put the second gap first.
+    """
+    gaussians = on_a_line(np.array([0.0, 1, 10, 10 + 1.5**0.5]))
+    assert_array_equal(merge_neighbours(gaussians, np.array([1.0, 100, 2, 2]), 3).is_new, [True, False, False])
+
+
 def test_colours_that_differ_are_far_apart():
     """The distances to the nearest are 1 and 1.2, so a difference of 1 in colour is 11 apart."""
     gaussians = on_a_line(np.array([0.0, 1, 20, 21.2]))

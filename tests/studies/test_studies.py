@@ -95,7 +95,7 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
         (["simplify", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
         (
             ["ablaton", "SCENE"],
-            "there is no study 'ablaton': choose from adaptive, folds, ablation, culling, simplify, max-drop, depth",
+            "there is no study 'ablaton': choose from adaptive, folds, ablation, culling, simplify, max-drop, mesh",
         ),
         (
             ["culling", "room", "--downscale", "2"],

@@ -5,14 +5,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.antialiasing.reference import VARIANCE, smooth, smooth_vjp
+from minisplat_ref.extensions.antialiasing.reference import VARIANCE, cap_smoothed_logits, smooth, smooth_vjp
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.sampling import sampling_intervals
-from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL
+from minisplat_ref.methods.gaussian_splatting import (
+    DENSIFY_LEAST_GAP,
+    GS_ACCEL,
+    lower_opacities,
+    reset_opacity,
+    reset_opacity_on_white,
+)
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
-from minisplat_ref.training.schedule import At, Every
+from minisplat_ref.training.schedule import Action, At, Every, action_name
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
 
@@ -84,6 +90,20 @@ def measure_filters(state: TrainState, iteration: Iteration, *, variance: float)
     state.gaussians = g._replace(filter_sigmas=sigmas.astype(g.filter_sigmas.dtype))
 
 
+def reset_smoothed_opacity(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
+    """Lower opacities until those of the filtered Gaussians are at most ``ceiling``, and forget their moments."""
+    g = state.gaussians
+    lower_opacities(state, cap_smoothed_logits(g.log_scales, g.opacity_logits, g.filter_sigmas, ceiling))
+
+
+def reset_smoothed_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: float) -> str | None:
+    """Do :func:`reset_smoothed_opacity` if the background is white."""
+    if not np.all(iteration.scene.background == 1.0):
+        return "nothing done: the background is not white"
+    reset_smoothed_opacity(state, iteration, ceiling=ceiling)
+    return None
+
+
 MIP = with_3d_filter(with_2d_filter(SPLATTING))
 """Mip-Splatting's renderer."""
 
@@ -97,9 +117,20 @@ FILTERED = Representation(
 )
 
 _measure = partial(measure_filters, variance=VARIANCE)
+_RESETS: dict[str, Action] = {
+    reset_opacity.__name__: partial(reset_smoothed_opacity, ceiling=0.01),
+    reset_opacity_on_white.__name__: partial(reset_smoothed_opacity_on_white, ceiling=0.01),
+}
 
 ANTIALIASING = GS_ACCEL._replace(
     name="antialiasing",
-    events=(*GS_ACCEL.events, At(1, _measure), Every(100, _measure, min_gap=DENSIFY_LEAST_GAP // 2)),
+    events=(
+        *(
+            event._replace(action=_RESETS[action_name(event)]) if action_name(event) in _RESETS else event
+            for event in GS_ACCEL.events
+        ),
+        At(1, _measure),
+        Every(100, _measure, min_gap=DENSIFY_LEAST_GAP // 2),
+    ),
 )
 """The recipe ``antialiasing``: 3DGS with Mip-Splatting's two filters."""

@@ -82,6 +82,30 @@ def smooth_vjp(
     return v_log_s, v_l, np.sum((v_log_scales - v_log_rho[:, None]) * per_sigma, axis=1)
 
 
+def cap_smoothed_logits(log_scales: Floats, opacity_logits: Floats, sigmas: Floats, ceiling: float) -> Floats:
+    """Return the logits with which smoothed Gaussians have at most the opacity ``ceiling``: Mip-Splatting's reset.
+
+    A filtered opacity is ``o' = rho o``, so o may be up to ``ceiling / rho``, whose logit is ``log(ceiling / (rho -
+    ceiling))``; where the filter alone makes a Gaussian as faint, with rho at most ``ceiling``, nothing changes.
+
+    Parameters
+    ----------
+    log_scales, opacity_logits, sigmas
+        As for :func:`smooth`.
+    ceiling : float
+        In (0, 1).
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        In the dtype of the inputs.
+    """
+    rhos = np.exp(-0.5 * np.log1p(_ratios(log_scales, sigmas)).sum(axis=1))  # [N]
+    with np.errstate(divide="ignore"):
+        most = np.where(rhos > ceiling, np.log(ceiling) - np.log(np.maximum(rhos - ceiling, 0)), np.inf)
+    return np.minimum(opacity_logits, most.astype(opacity_logits.dtype))
+
+
 def _ratios(log_scales: Floats, sigmas: Floats) -> Floats:
     """Return t = sigma^2 / s^2 [N, 3], at most the largest finite number."""
     with np.errstate(over="ignore"):

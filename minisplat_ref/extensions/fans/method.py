@@ -13,6 +13,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians, mesh_of, mesh_of_vjp
 from minisplat_ref.io.frames import Unit
+from minisplat_ref.mechanisms.meshes.fans import turn_balls
 from minisplat_ref.mechanisms.peeling import kernels as kernels
 from minisplat_ref.mechanisms.peeling import reference as reference
 from minisplat_ref.mechanisms.peeling.layers import ALL_LAYERS, Frame, Peeled, TranslucentMesh
@@ -32,8 +33,8 @@ OPACITY_MIN = 0.02  # of a fan's most opaque vertex: 5 of 255
 def as_fans(
     gaussians: Gaussians, rng: np.random.Generator, *, n_sides: int, reach: float, rim: float, is_flat: bool
 ) -> Fans:
-    """Return the fans of Gaussians; see :class:`.shapes.FanShape`."""
-    return convert_gaussians(gaussians, FanShape(n_sides, reach, rim, is_flat))
+    """Return the fans of Gaussians, where balls face at random; see :class:`.shapes.FanShape`."""
+    return convert_gaussians(turn_balls(gaussians, rng), FanShape(n_sides, reach, rim, is_flat))
 
 
 class _Tape(NamedTuple):

@@ -21,7 +21,7 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED, TITLE_COLOR
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.studies import kit
-from minisplat_ref.studies.figures import show, with_range
+from minisplat_ref.studies.figures import show, with_deviation
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import During, Every, scale_recipe
@@ -200,10 +200,10 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train the chart with every variant and seed."""
     outcomes = measure(args.iterations, args.seeds, args.beta, args.trace)
     found = {name: {key: [getattr(one, key) for one in own] for key in NUMBERS} for name, own in outcomes.items()}
-    rows = [[name, *(with_range(numbers[key], 2) for key in NUMBERS)] for name, numbers in found.items()]
+    rows = [[name, *(with_deviation(numbers[key], 2) for key in NUMBERS)] for name, numbers in found.items()]
     table = markdown_table(["variant", *NUMBERS.values()], rows)
     result = {**kit.settings_of(args, "iterations", "seeds", "beta", "trace"), "variants": found}
-    text = f"mean over the seeds ± half their range\n\n{table}"
+    text = f"mean over the seeds ± standard deviation\n\n{table}"
     return kit.Report(result, draw(outcomes, args.beta, args.trace), text, arms=found)
 
 

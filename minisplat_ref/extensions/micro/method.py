@@ -16,7 +16,8 @@ from minisplat_ref.extensions.micro.reference import (
 from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL, clone_and_split
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.strategy import clone_split, simplify
-from minisplat_ref.strategy.ops import n_rows, take
+from minisplat_ref.strategy.importance import mass_mask
+from minisplat_ref.strategy.ops import keep, n_rows, take
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 from minisplat_ref.training.schedule import During, Event, Every, does
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
@@ -25,6 +26,7 @@ from minisplat_ref.types import Floats, Gaussians, Ints, Scene
 # The abstract gives neither lambda, tau nor beta. These were chosen on the fox at 67 x 120 pixels.
 WEIGHT, LIMIT, BETA = 1e-3, 0.05, 0.5
 MERGE_REACH, MERGE_COLOR = 1.0, 0.1
+SCORE_MASS = 0.99
 
 
 def squared_limit(scene: Scene, trace_limit: float) -> float:
@@ -108,6 +110,20 @@ def halve_large(state: TrainState, iteration: Iteration, *, trace: float, trace_
     return None
 
 
+def prune_least(state: TrainState, iteration: Iteration, *, score_mass: float) -> str | None:
+    """Keep the Gaussians of the largest scores, opacity times size, that together carry this fraction of the sum.
+
+    The size is ``sqrt(tr(Sigma))``. With a ``score_mass`` of 1 all are kept.
+    """
+    g = state.gaussians
+    opacities = 1 / (1 + np.exp(-g.opacity_logits.astype(np.float64)))
+    scores = opacities * np.sqrt(traces(g.log_scales.astype(np.float64)))
+    if score_mass == 1 or not np.isfinite(scores).all():
+        return "nothing done: all are kept"
+    apply_edit(state, keep(g, np.flatnonzero(mass_mask(scores, score_mass))))
+    return None
+
+
 def clusters(gaussians: Gaussians, *, reach: float, color_reach: float) -> Ints:
     """Return labels [N] for merging: mutual nearest neighbours that are alike share one, all others have their own."""
     labels = np.arange(n_rows(gaussians))
@@ -143,6 +159,8 @@ def _with_detail(event: Event) -> Event:
 
 
 _collect, *_others = GS_ACCEL.events
+# From the first occasion after densification on, also in shorter runs.
+_in_stage_two = partial(Every, 1_000, start=14_999, stop=25_000, min_gap=DENSIFY_LEAST_GAP)
 
 MICRO = GS_ACCEL._replace(
     name="micro",
@@ -158,13 +176,8 @@ MICRO = GS_ACCEL._replace(
             stop=15_000,
             min_gap=DENSIFY_LEAST_GAP,
         ),
-        Every(
-            1_000,
-            partial(merge_alike, merge_reach=MERGE_REACH, merge_color=MERGE_COLOR),
-            start=14_999,  # the first occasion after densification, also in shorter runs
-            stop=25_000,
-            min_gap=DENSIFY_LEAST_GAP,
-        ),
+        _in_stage_two(partial(prune_least, score_mass=SCORE_MASS)),
+        _in_stage_two(partial(merge_alike, merge_reach=MERGE_REACH, merge_color=MERGE_COLOR)),
     ),
 )
 """The recipe ``micro``: 3DGS with small Gaussians, more of them in front of detail, and fewer duplicates."""

@@ -1,7 +1,8 @@
 """The study ``multi-scale/downscale``: a trained scene in smaller and smaller images.
 
 The truth at 1/n of the size is the mean over blocks of n x n pixels of the held-out photographs. Beside the error the
-study counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended.
+study counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended. Levels are
+compared with the compensation of opacities, on the same Gaussians and on those of a training with it.
 """
 
 import argparse
@@ -18,9 +19,9 @@ from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, fi
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
+from minisplat_ref.reports.palette import BLUE, BROWN, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
 from minisplat_ref.studies import kit
-from minisplat_ref.studies.figures import plot_range, show
+from minisplat_ref.studies.figures import plot_band, show
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Floats, Model, Scene, view_from
@@ -32,8 +33,8 @@ EARLY = 4  # cells are divided by this, so that coarse Gaussians appear while th
 COMPENSATED = GSPLAT_MAIN._replace(is_antialiased=True)
 COLORS = dict(
     zip(
-        ("3dgs", "compensated", *PLANS, "levels 4, compensated", "too early", "trained"),
-        (GREY, OCHRE, GREEN, BLUE, TEAL, PURPLE, RED),
+        ("3dgs", "compensated", "trained compensated", *PLANS, "levels 4, compensated", "too early", "trained"),
+        (GREY, OCHRE, BROWN, GREEN, BLUE, TEAL, PURPLE, RED),
         strict=True,
     )
 )
@@ -57,7 +58,10 @@ class Figures(NamedTuple):
 
 def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     """Train the scene without and with levels, and build levels for the former; return all variants by name."""
-    plain = train(scene, find_recipe("3dgs", iterations), seed=seed, backend=CPU).gaussians
+    plain, compensated = (
+        train(scene, find_recipe("3dgs", iterations), seed=seed, backend=CPU, conventions=conventions).gaussians
+        for conventions in (GSPLAT_MAIN, COMPENSATED)
+    )
     zero = level_zero(plain, np.random.default_rng(0))
     densities = finest_densities(plain.means, [view.camera for view in scene.train_views])
     built = {name: with_levels(zero, densities, plan, GSPLAT_MAIN) for name, plan in PLANS.items()}
@@ -67,6 +71,7 @@ def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     return {
         "3dgs": Variant(plain, SPLATTING),
         "compensated": Variant(plain, SPLATTING, COMPENSATED),
+        "trained compensated": Variant(compensated, SPLATTING, COMPENSATED),
         **{name: Variant(gaussians, LEVELS.renderer) for name, gaussians in built.items()},
         "levels 4, compensated": Variant(built["levels 4"], LEVELS.renderer, COMPENSATED),
         "too early": Variant(early, LEVELS.renderer),
@@ -150,8 +155,8 @@ def draw(found: Measured) -> Figure:
     left, right = upper.subplots(1, 2)
     for name, color in COLORS.items():
         values = np.array(found.figures[name])  # [seeds, blocks, 3]
-        plot_range(left, found.blocks, values[..., 0], color, name)
-        plot_range(right, found.blocks, values[..., 2], color, name)
+        plot_band(left, found.blocks, values[..., 0], color, name)
+        plot_band(right, found.blocks, values[..., 2], color, name)
     for axes, title in ((left, "PSNR of test views (dB)"), (right, "blended hits per view")):
         axes.set_xscale("log", base=2)
         axes.set_xticks(found.blocks, _sizes(found))

@@ -20,7 +20,7 @@ from scipy.special import erf, expit, logit
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, LIGHT_BLUE, MIDDLE_BLUE, OCHRE, RED
 from minisplat_ref.studies import kit
-from minisplat_ref.studies.figures import plot_range, show, with_range
+from minisplat_ref.studies.figures import plot_band, show, with_deviation
 from minisplat_ref.types import Floats
 
 OUTER = 0.7  # radius; the image is the square from -1 to 1
@@ -164,9 +164,10 @@ def run(args: argparse.Namespace) -> kit.Report:
     result = {**kit.settings_of(args, "seeds", "starts"), "thicknesses": list(THICKNESSES), "psnr": psnrs}
     result |= {"mean_psnr": means, "crossings": crossed, "heights": heights}
     rows = [
-        [f"{thickness}", *(with_range(psnrs[name][t], 1) for name in MODELS)] for t, thickness in enumerate(THICKNESSES)
+        [f"{thickness}", *(with_deviation(psnrs[name][t], 1) for name in MODELS)]
+        for t, thickness in enumerate(THICKNESSES)
     ]
-    text = "PSNR (dB) of the best fit: mean over the seeds ± half their range\n\n"
+    text = "PSNR (dB) of the best fit: mean over the seeds ± standard deviation\n\n"
     text += markdown_table(["thickness / outer radius", *MODELS], rows) + "\n"
     for pair, others in crossed.items():
         places = [f"{name} at {', '.join(f'{x:.2f}' for x in xs) or 'no thickness'}" for name, xs in others.items()]
@@ -181,7 +182,7 @@ def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:
     axes = left.subplots()
     for name, model in MODELS.items():
         values = np.array([[fit.psnr for fit in fits[thickness][name]] for thickness in THICKNESSES])  # [T, seeds]
-        plot_range(axes, THICKNESSES, values.T, model.color, name)
+        plot_band(axes, THICKNESSES, values.T, model.color, name)
     axes.set(title="best fit, PSNR (dB)", xlabel="thickness of the ring / outer radius")
     axes.set_ylim(bottom=axes.get_ylim()[0] - 2)  # room for the legend
     axes.legend(loc="lower center", ncols=2)

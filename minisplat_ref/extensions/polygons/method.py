@@ -7,6 +7,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
 from minisplat_ref.extensions.polygons.kernels import RESPONSE, fans_of, tree_of
 from minisplat_ref.extensions.polygons.reference import prepare_meeting
+from minisplat_ref.mechanisms.meshes.fans import turn_balls
 from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
@@ -25,22 +26,11 @@ def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -
 
 
 def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are rotated at random first.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-        Of any shape. Those that training starts from are balls, whose axes say nothing: along the first of them all
-        polygons would face the same way, and a camera in their planes would see none.
-    rng : Generator
-        For the directions of the balls.
-    """
-    log_scales, quats = gaussians.log_scales.copy(), gaussians.quats.copy()
-    is_ball = np.ptp(log_scales, axis=1) == 0
-    quats[is_ball] = rng.normal(size=(is_ball.sum(), 4))
-    rows = np.arange(len(log_scales))
+    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are rotated at random first."""
+    turned = turn_balls(gaussians, rng)
+    log_scales, rows = turned.log_scales.copy(), np.arange(len(turned.log_scales))
     log_scales[rows, np.argmin(log_scales, axis=1)] = LOG_THICKNESS
-    return gaussians._replace(log_scales=log_scales, quats=quats)
+    return turned._replace(log_scales=log_scales)
 
 
 TRACED = Representation(

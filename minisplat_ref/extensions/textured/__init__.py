@@ -7,7 +7,8 @@ direction. Here a ray hits a point n on the Gaussian's ellipsoid of one standard
 
     opacity(n) = sigmoid(l + sum_k h_k Y_k(n)),   color(n) = max(0, c + sum_k k_k Y_k(n)),   k = 1 ... 15
 
-Textures are trained for the Gaussians of a finished Mini-Splatting run, whose number, positions and shapes stay. With
+Textures are trained for the Gaussians of a finished Mini-Splatting run, whose number stays. Their positions and shapes
+are trained, too, as by the released code; ``--frozen`` leaves them as they are, as the paper's text has it. With
 textures of degree 0 the method is 3DGS, to the last byte.
 
     minisplat-ref train SCENE --recipe mini-splatting --out runs/few
@@ -23,8 +24,8 @@ This deviates from the paper as follows. The ellipsoid is exactly that of one st
 divides by standard deviations where their squares belong. Most rays that a footprint reaches miss the ellipsoid. In the
 paper these get the colour of degree 0, which jumps at the limb; here n points to the ray's nearest point, which does
 not. In the paper textures replace view-dependent colour, which ``--replace`` does; otherwise they are added to it after
-it has been clamped at zero. The recipe ``textured`` trains textures and shapes together from the first iteration on,
-which the paper does not.
+it has been clamped at zero, as colours of 3DGS are. The released code has a sigmoid there. The recipe ``textured``
+trains textures and shapes together from the first iteration on, which the paper does not.
 """
 
 from minisplat_ref.extensions.extension import Extension
@@ -39,6 +40,7 @@ COUNTS = study.declare(
     f"{__name__}.study.run",
     *study.trainings(1000, "mini-splatting"),
     study.fine_tune(500),
+    study.argument("--frozen", action="store_true", help="train no positions and shapes"),
 )
 LIMB = study.declare("limb", "whether a texture jumps where rays begin to miss", f"{__name__}.study.run_limb")
 EXTENSION = Extension(

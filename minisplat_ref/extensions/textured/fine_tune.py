@@ -15,7 +15,7 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "fine-tune",
-        help="train textures for the Gaussians of a run, which stay where they are",
+        help="train textures for the Gaussians of a run, whose number stays",
         epilog="example: minisplat-ref textured fine-tune SCENE runs/few/point_cloud.ply --out textured.ply",
     )
     parser.add_argument("scene", metavar="SCENE", help="folder that the run was trained on")
@@ -29,6 +29,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--replace", action="store_true", help="replace the view-dependent colour by textures, as in the paper"
     )
+    parser.add_argument("--frozen", action="store_true", help="train no positions and shapes, as the paper's text says")
     seed("of the training")(parser)
     parser.set_defaults(run=run)
 
@@ -57,7 +58,9 @@ def run(args: argparse.Namespace) -> int:
     before = measure(gaussians, scene, scene.test_views)
     with tqdm(total=args.iterations, desc="textures", leave=False, disable=None) as bar:
         start = prepare(gaussians, args.degree, args.replace)
-        textured = fine_tune(start, scene, args.iterations, args.seed, lambda _: bar.update())
+        textured = fine_tune(
+            start, scene, args.iterations, args.seed, is_frozen=args.frozen, on_step=lambda _: bar.update()
+        )
     after = measure(textured, scene, scene.test_views)
     save_ply(args.out, textured, Label("textured"))
     print(

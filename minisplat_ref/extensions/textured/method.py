@@ -88,10 +88,10 @@ TEXTURED_GAUSSIANS = Representation(
 TEXTURED = GS_ACCEL._replace(name="textured")
 """The recipe ``textured``: 3DGS with textures from the first iteration on."""
 
-FINE_TUNING = GS._replace(
-    name="textured-fine-tuning",
-    learning_rates=GS.learning_rates.change(means=0.0, quats=0.0, log_scales=0.0),
-    events=(),
-    sh_milestones=(0, 0, 0),
-)
-"""The paper's fine-tuning: opacities, colours and textures are trained, and nothing else changes."""
+_LAST = GS.learning_rates.change(**GS.learning_rates.at(GS.iterations, extent=1.0))  # means at their last rate
+
+FINE_TUNING = GS._replace(name="textured-fine-tuning", learning_rates=_LAST, events=(), sh_milestones=(0, 0, 0))
+"""Fine-tuning as released: of a finished run only the number of Gaussians stays."""
+
+FROZEN = FINE_TUNING._replace(name="textured-frozen", learning_rates=_LAST.change(means=0.0, quats=0.0, log_scales=0.0))
+"""Fine-tuning as in the paper's text: opacities, colours and textures are trained, and nothing else changes."""

@@ -4,13 +4,15 @@
 come from a training with Mini-Splatting or from a PLY. They are fine-tuned for the same number of iterations without
 textures, with textures instead of view-dependent colour (the paper's form), and with both; textures of degree 1 and 2
 are tried, too. Then only this many of the most important Gaussians are kept that the textured ones have no more floats
-than the plain ones had.
+than the plain ones had. With ``--frozen`` positions and shapes stay.
 
 ``limb`` asks whether the colour jumps where rays begin to miss the ellipsoid. A row of rays crosses the limb of one
 Gaussian; the largest change from one to the next is compared with that of a texture that ends at the limb.
 """
 
 import argparse
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,15 +40,22 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train, fine-tune and measure."""
     scene = kit.read_scene(args.scene, args.downscale)
     wholes = kit.populations(args, scene)
-    runs = [outcomes(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
-    result = {**kit.describe_trainings(args, scene), "fine_tune": args.fine_tune, "runs": runs}
+    fine_tuned = partial(fine_tune, scene=scene, iterations=args.fine_tune, is_frozen=args.frozen)
+    runs = [outcomes(whole, scene, partial(fine_tuned, seed=seed)) for seed, whole in enumerate(wholes)]
+    result = {
+        **kit.describe_trainings(args, scene),
+        "fine_tune": args.fine_tune,
+        "is_frozen": args.frozen,
+        "runs": runs,
+    }
     heading = ["Gaussians", "with", "degree", "number", "floats", "test PSNR", "test SSIM", "training PSNR"]
-    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations\n\n{markdown_table(heading, to_rows(runs))}"
+    frozen = ", positions and shapes frozen" if args.frozen else ""
+    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations{frozen}\n\n{markdown_table(heading, to_rows(runs))}"
     arms = {f"{row['form']}, {row['kept']}, degree {row['degree']}": row for rows in runs[:1] for row in rows}
     return kit.Report(result, draw(result), text, {name: row["psnr"] for name, row in arms.items()})
 
 
-def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
+def outcomes(whole: Gaussians, scene: Scene, fine_tuned: Callable[[Any], Any]) -> list[dict[str, Any]]:
     """Return the measurements of each form of a trained population."""
     importance = indoor(collect_importance(whole, scene.train_views))
     jobs: list[tuple[str, str, int, Any]] = [("all", PLAIN, 0, whole)]
@@ -58,8 +67,8 @@ def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
         kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
         jobs.append(("as many floats", form, 3, prepare(kept, 3, replaces)))
     rows = []
-    for kept_by, form, degree, population in kit.with_progress(jobs, f"seed {seed}"):
-        after = fine_tune(population, scene, iterations, seed)
+    for kept_by, form, degree, population in kit.with_progress(jobs, "populations"):
+        after = fine_tuned(population)
         test, training = (measure(after, scene, views) for views in (scene.test_views, scene.train_views))
         rows.append(
             {

@@ -1,9 +1,9 @@
-"""Fine-tuning: trained Gaussians keep position, shape and number, and get textures."""
+"""Fine-tuning: trained Gaussians keep their number, and get textures."""
 
 from collections.abc import Callable
 from typing import Any
 
-from minisplat_ref.extensions.textured.method import FINE_TUNING, TEXTURED_GAUSSIANS
+from minisplat_ref.extensions.textured.method import FINE_TUNING, FROZEN, TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import RenderSettings
@@ -27,11 +27,31 @@ def representation_of(population: Any) -> Representation:
 
 
 def fine_tune(
-    population: Any, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
+    population: Any,
+    scene: Scene,
+    iterations: int,
+    seed: int,
+    *,
+    is_frozen: bool = False,
+    on_step: Callable[[StepReport], None] | None = None,
 ) -> Any:
-    """Return a population with or without textures after fine-tuning; the given one is not changed."""
-    recipe = scale_recipe(FINE_TUNING, iterations)._replace(representation=representation_of(population))
-    return kit.fine_tune(population, scene, recipe, seed, on_step)
+    """Return a population with or without textures after fine-tuning; the given one is not changed.
+
+    Parameters
+    ----------
+    population : Gaussians or TexturedGaussians
+    scene : Scene
+    iterations, seed : int
+        Of the training.
+    is_frozen : bool
+        Whether positions and shapes stay.
+    on_step : callable, optional
+        Called after each iteration.
+    """
+    recipe = scale_recipe(FROZEN if is_frozen else FINE_TUNING, iterations)
+    return kit.fine_tune(
+        population, scene, recipe._replace(representation=representation_of(population)), seed, on_step
+    )
 
 
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import Floats, Gaussians, Ints
 
 N_SIDES = 8
 REACH = 11.3449  # q: 99 % of a normal distribution in three dimensions lies within sqrt(q) standard deviations
@@ -69,6 +69,25 @@ def plane_axes(log_scales: Floats) -> Ints:
     """
     normal = np.argmin(log_scales, axis=1)
     return (normal[:, None] + np.array([1, 2, 3])) % 3
+
+
+def turn_balls(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Return the Gaussians with a random rotation for each ball.
+
+    Training starts from balls, whose axes say nothing. All would become flat along the first of them, face the same
+    way, and be invisible to a camera in their planes.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Of any shape; those that are no balls stay as they are.
+    rng : Generator
+        For the rotations.
+    """
+    quats = gaussians.quats.copy()
+    is_ball = np.ptp(gaussians.log_scales, axis=1) == 0
+    quats[is_ball] = rng.normal(size=(np.count_nonzero(is_ball), 4))
+    return gaussians._replace(quats=quats)
 
 
 def flatten(means: Floats, quats: Floats, log_scales: Floats) -> Flat:
