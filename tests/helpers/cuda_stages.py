@@ -51,7 +51,8 @@ def run_stages(case: Case, backend: Backend, dtype: type, given: dict | None = N
     g = make_gaussians(
         rng, case.n_gaussians, sh_degree=case.sh_degree, opacity_logit=case.opacity_logit, size=case.gaussian_size
     )
-    g.means[:2, 2] = -1  # behind the camera
+    g.means[2:4, 2] = -1  # behind the camera
+    g.sh_dc[:] *= 3  # some colours are negative in one channel
     g, conventions = as_dtype(as_dtype(g, case.dtype), dtype), case.conventions
     colors = rng.uniform(size=(case.n_gaussians, case.n_channels)).astype(case.dtype).astype(dtype)
     background = rng.uniform(size=case.n_channels).astype(case.dtype).astype(dtype)
