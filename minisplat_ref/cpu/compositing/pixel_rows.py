@@ -55,8 +55,8 @@ def start_tile(tile, lists, frame):
 
 
 @scalar
-def list_rows(boxes, ids, tile, lists, frame):
-    """Distribute a tile's list to its rows of eight pixels.
+def list_rows(boxes, tile, lists, frame):
+    """Distribute a tile's list ``ids`` to its rows of eight pixels.
 
     Returns
     -------
@@ -65,6 +65,7 @@ def list_rows(boxes, ids, tile, lists, frame):
     counts : ndarray of shape (n_rows,)
         How many of them there are.
     """
+    ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
     x0, y0, n_per_line = start_tile(tile, lists, frame)
     x_end, y_end = min(x0 + lists.tile_width, frame.width), min(y0 + lists.tile_height, frame.height)
     members = np.empty((lists.tile_height * n_per_line, ids.size), np.int32)
@@ -80,15 +81,14 @@ def list_rows(boxes, ids, tile, lists, frame):
 
 
 @scalar
-def rows_of_tile(tile, primitives, lists, frame):
-    """Yield the rows of a tile that lie inside the image."""
-    ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
-    members, counts = list_rows(primitives.boxes, ids, tile, lists, frame)
+def row_of_tile(i, tile, members, counts, lists, frame):
+    """Return row i of a tile, which may lie outside of the image; the others are what :func:`list_rows` returned.
+
+    A generator of rows would read better, but Numba never frees the arrays that a generator holds.
+    """
     x0, y0, n_per_line = start_tile(tile, lists, frame)
-    for i in range(counts.size):
-        x, y = x0 + i % n_per_line * WIDTH, y0 + i // n_per_line
-        if x < frame.width and y < frame.height:
-            yield Row(x, y, ids, members[i, : counts[i]])
+    ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
+    return Row(x0 + i % n_per_line * WIDTH, y0 + i // n_per_line, ids, members[i, : counts[i]])
 
 
 @scalar

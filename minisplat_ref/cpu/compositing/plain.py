@@ -38,8 +38,9 @@ from minisplat_ref.cpu.compositing.pixel_rows import (
     field_of,
     full_transmittance,
     hit_row,
+    list_rows,
+    row_of_tile,
     row_pixels,
-    rows_of_tile,
 )
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -97,7 +98,11 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
             for tile in dynamic_range(taken, lists.offsets.size - 1):
                 n_listed = lists.offsets[tile + 1] - lists.offsets[tile]
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
-                for row in rows_of_tile(tile, primitives, lists, frame):
+                members, counts = list_rows(primitives.boxes, tile, lists, frame)
+                for i in range(counts.size):
+                    row = row_of_tile(i, tile, members, counts, lists, frame)
+                    if row.x >= frame.width or row.y >= frame.height:
+                        continue
                     state[:] = ZERO
                     store(state, 0, full_transmittance(row, frame, state.dtype.type))
                     if is_sorted:
@@ -202,7 +207,11 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                 first, n_listed = lists.offsets[tile], lists.offsets[tile + 1] - lists.offsets[tile]
                 sums = np.zeros(n_listed * n_sums * WIDTH, slots.dtype)
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
-                for row in rows_of_tile(tile, primitives, lists, frame):
+                members, counts = list_rows(primitives.boxes, tile, lists, frame)
+                for i in range(counts.size):
+                    row = row_of_tile(i, tile, members, counts, lists, frame)
+                    if row.x >= frame.width or row.y >= frame.height:
+                        continue
                     start_row(state, output, v_output, row, frame)
                     if is_sorted:
                         chain_sorted_row(sums, v_place, buffer, state, primitives, row, lists.buffer_size, frame)
