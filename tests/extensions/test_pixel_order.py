@@ -23,7 +23,7 @@ from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
 from minisplat_ref.mechanisms.tangent import planes as planes
-from minisplat_ref.mechanisms.tangent.rays import tangent_hits, yaw_camera
+from minisplat_ref.mechanisms.tangent.rays import color_changes, orbit_camera, tangent_hits, yaw_camera
 from minisplat_ref.mechanisms.tangent.renderer import RESPONSE
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
@@ -421,7 +421,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
     ],
 )
 def test_the_studies(study, options, says, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(clouds, "WALK_STEPS", 2)
+    monkeypatch.setattr(clouds, "ORBIT_STEPS", 2)
     out = tmp_path / "study"
     assert main(["study", f"pixel-order/{study}", *options, "--out", str(out)]) == 0
     assert (out / "figure.png").stat().st_size > 10_000 and says in capsys.readouterr().out
@@ -429,6 +429,32 @@ def test_the_studies(study, options, says, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["study", f"pixel-order/{study}", "--gaussians", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()
+
+
+def test_an_orbit_by_hand():
+    """A quarter of a circle about (0, 0, 4) takes the camera from the origin to 4 beside the centre, which it faces."""
+    for quarter, x in ((np.pi / 2, 4.0), (-np.pi / 2, -4.0)):
+        seen_by = orbit_camera(clouds.wide_camera(), quarter, clouds.CENTER)
+        assert_allclose(seen_by.center, [x, 0, 4], atol=1e-12)
+        assert_allclose(seen_by.cam_from_world_R.T @ [0, 0, 1], [-x / 4, 0, 0], atol=1e-12)
+
+
+def test_changes_by_hand(monkeypatch):
+    """A ray whose colour goes evenly from 0 to 0.4, and one that jumps by 0.4 in the third of four steps."""
+    colors = np.array([[0.0, 0.1, 0.2, 0.3, 0.4], [0, 0, 0, 0.4, 0.4]])
+    shown = iter(np.repeat(colors.T[:, :, None], 3, axis=2))
+    monkeypatch.setattr("minisplat_ref.mechanisms.tangent.rays.ray_colors", lambda *_: next(shown))
+    found = color_changes("", None, None, [None] * 5, [None] * 5, None)
+    assert_allclose(found.largest, [0.1, 0.1, 0.4, 0.1])
+    assert_allclose(found.mean, [0.05, 0.05, 0.25, 0.05])
+    assert found.flicker == pytest.approx(0.8 / 2)
+
+
+def test_whole_gaussians_that_change_places_at_once_make_the_image_jump():
+    """In an orbit in steps of a hundredth of a degree the mean of the rays jumps by camera z, and not by pixels."""
+    found = clouds.rotation(60, 2, 0)
+    by_z, by_pixel = found["3DGS: EWA, by z"], found["tangent planes, exact order"]
+    assert by_z["orbit_in_tenths_mean"] > 2 * by_pixel["orbit_in_tenths_mean"]
 
 
 def test_a_run_without_test_views_is_refused(tmp_path, capsys):

@@ -13,8 +13,8 @@ from minisplat_ref.mechanisms.tangent.rays import (
     color_changes,
     count_misordered,
     ewa_hits,
+    orbit_camera,
     tangent_hits,
-    translate_camera,
     yaw_camera,
 )
 from minisplat_ref.reference.covariance import covariances
@@ -29,15 +29,16 @@ from minisplat_ref.types import Camera, Floats, Gaussians, Primitives
 BARE = GSPLAT_MAIN._replace(eps2d=0.0)
 ANGLES = (0.0, 15.0, 30.0, 45.0, 55.0)  # degrees off the optical axis
 BUFFERS = {"list by distance": LIST_ORDER, "buffer of 4": 4, "buffer of 8": 8, "buffer of 16": 16, "exact": EXACT_ORDER}
-WALK, WALK_STEPS = 0.4, 40  # sideways distance in world units, and steps
-WALKS = {"walk": 1, "walk_in_tenths": 10}
+ORBIT, ORBIT_STEPS = 2.0, 40  # degrees to either side, and steps
+ORBITS = {"orbit": 1, "orbit_in_tenths": 10}
+CENTER = np.array([0.0, 0.0, 4.0])  # of the random Gaussians
 CHUNK = 64  # pixels at a time
 COLORS = (GREY, OCHRE, GREEN, BLUE, RED)
 
 
 def cloud(n: int, rng: np.random.Generator) -> tuple[Primitives, Floats]:
     """Return n overlapping anisotropic Gaussians around (0, 0, 4), 0.03 to 0.6 large, and their colours [n, 3]."""
-    means = rng.normal(size=(n, 3)) * [1.2, 0.8, 0.8] + [0, 0, 4]
+    means = rng.normal(size=(n, 3)) * [1.2, 0.8, 0.8] + CENTER
     scales = np.exp(rng.uniform(np.log(0.03), np.log(0.6), (n, 3)))
     return Primitives(means, rng.normal(size=(n, 4)), scales, rng.uniform(0.2, 0.95, n)), rng.uniform(size=(n, 3))
 
@@ -59,32 +60,43 @@ def rays_ahead(n: int, half_angle: float) -> Floats:
 
 
 def rotation(n: int, n_steps: int, seed: int, conventions: Conventions = GSPLAT_MAIN) -> dict[str, dict[str, Any]]:
-    """Return the changes of colours per step by method, in a yaw of +-20 degrees and in sideways walks.
+    """Return the changes of colours per step by method, in a yaw of +-20 degrees and in an orbit of +-2.
 
-    The rays stay fixed, and the worst ray counts. In walks the mean over the rays is returned, too: where the order of
-    two whole Gaussians changes at once, the mean jumps, even if steps are ten times shorter; where pixels change one
-    after the other, it does not.
+    In the yaw rays stay fixed, and the worst counts. In the orbit, around the middle of the Gaussians, they turn with
+    the camera; Gaussians pass each other, so that every order changes. The worst ray and the mean over the rays are
+    returned: where the order of two whole Gaussians changes at once, the mean jumps, even if steps are ten times
+    shorter; where pixels change one after the other, it does not.
     """
     primitives, colors = cloud(n, np.random.default_rng(seed))
-    camera, rays = wide_camera(), rays_ahead(8, 18.0)
+    camera, rays, many_rays = wide_camera(), rays_ahead(8, 18.0), rays_ahead(16, 18.0)
     yaws = [yaw_camera(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
     found: dict[str, dict[str, Any]] = {}
     for method in kit.with_progress(METHODS, "methods"):
-        found[method] = {"yaw": color_changes(method, primitives, colors, yaws, rays, conventions)[0].tolist()}
-        for name, k in WALKS.items():
-            path = [translate_camera(camera, dx) for dx in np.linspace(0, WALK, k * WALK_STEPS + 1)]
-            worst, mean = color_changes(method, primitives, colors, path, rays, conventions)
-            found[method] |= {f"{name}_worst": float(worst.max()), f"{name}_mean": float(mean.max())}
+        turned = color_changes(method, primitives, colors, yaws, [rays] * len(yaws), conventions)
+        found[method] = {"yaw": turned.largest.tolist()}
+        for name, k in ORBITS.items():
+            angles = np.radians(np.linspace(-ORBIT, ORBIT, k * ORBIT_STEPS + 1))
+            path = [orbit_camera(camera, angle, CENTER) for angle in angles]
+            carried = [many_rays @ seen_by.cam_from_world_R for seen_by in path]
+            moved = color_changes(method, primitives, colors, path, carried, conventions)
+            found[method] |= {
+                f"{name}_worst": float(moved.largest.max()),
+                f"{name}_mean": float(moved.mean.max()),
+                f"{name}_flicker": moved.flicker,
+            }
     return found
 
 
 def run_rotation(args: argparse.Namespace) -> kit.Report:
     """Rotate and move a camera."""
     found = rotation(args.gaussians, args.steps, args.seed)
-    keys = ("walk_worst", "walk_in_tenths_worst", "walk_mean", "walk_in_tenths_mean")
+    keys = [f"{name}_{what}" for what in ("worst", "mean", "flicker") for name in ORBITS]
     rows = [[method, f"{max(v['yaw']):.1e}", *(f"{v[key]:.1e}" for key in keys)] for method, v in found.items()]
-    heads = ["worst ray, yaw", "worst ray, walk", "tenth of a step", "mean of rays, walk", "tenth of a step"]
-    text = f"Largest change of fixed rays' colours in a step of {40 / args.steps:g} degrees, or of a sideways walk\n\n"
+    heads = ["worst ray, yaw", "worst ray, orbit", "in tenths", "mean of rays", "in tenths", "flicker", "in tenths"]
+    text = (
+        f"Largest change of rays' colours in a step: of a yaw of {40 / args.steps:g} degrees, of an orbit of"
+        f" {2 * ORBIT / ORBIT_STEPS:g}, and of a tenth of that\n\n"
+    )
     result = {**kit.settings_of(args, "gaussians", "seed"), "ways": found}
     return kit.Report(result, draw_rotation(found), text + markdown_table(["method", *heads], rows))
 

@@ -150,8 +150,10 @@ def yaw_steps(
     path = [yaw_camera(camera, yaw) for yaw in np.radians(np.linspace(-half_angle, half_angle, n_steps + 1))]
     rows = _hit_rows(primitives, path[:: max(n_steps // 4, 1)], rays)
     seen = Primitives._make(field[rows] for field in primitives)
-    seen_by = (seen, colors[rows], path, rays, GSPLAT_MAIN)
-    return {method: color_changes(method, *seen_by)[0].tolist() for method in kit.with_progress(METHODS, "methods")}
+    seen_by = (seen, colors[rows], path, [rays] * len(path), GSPLAT_MAIN)
+    return {
+        method: color_changes(method, *seen_by).largest.tolist() for method in kit.with_progress(METHODS, "methods")
+    }
 
 
 def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Ints:

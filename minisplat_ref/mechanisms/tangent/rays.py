@@ -1,6 +1,6 @@
-"""Colours on given rays instead of pixels, for studies that turn a camera and look along the same rays again."""
+"""Colours on given rays instead of pixels, for studies that turn or move a camera and look again."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -116,27 +116,50 @@ def yaw_camera(camera: Camera, yaw: float) -> Camera:
     return camera._replace(cam_from_world_R=R, cam_from_world_t=Y @ np.asarray(camera.cam_from_world_t, np.float64))
 
 
-def translate_camera(camera: Camera, dx: float) -> Camera:
-    """Return the camera moved by ``dx`` world units along its own x axis."""
-    return camera._replace(cam_from_world_t=camera.cam_from_world_t - np.array([dx, 0.0, 0.0]))
+def orbit_camera(camera: Camera, angle: float, center: Floats) -> Camera:
+    """Return the camera carried by ``angle`` radians around a vertical axis, world y, through ``center`` [3]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    Y = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+    R = np.asarray(camera.cam_from_world_R, np.float64)
+    return camera._replace(cam_from_world_R=R @ Y, cam_from_world_t=R @ (center - Y @ center) + camera.cam_from_world_t)
+
+
+class Changes(NamedTuple):
+    """How much the colours of P rays change along a path of n cameras; the channel that changes most counts."""
+
+    largest: Floats
+    """[n - 1] of the rays, in each step."""
+    mean: Floats
+    """[n - 1] over the rays, in each step."""
+    flicker: float
+    """What the changes themselves change by from step to step, summed over the path, as a mean over the rays: a colour
+    that changes evenly has none, however far it goes, and each jump counts twice."""
 
 
 def color_changes(
     method: str,
     primitives: Primitives,
     colors: Floats,
-    path: list[Camera],
-    rays: Floats,
+    path: Sequence[Camera],
+    rays: Sequence[Floats],
     conventions: Conventions,
-) -> tuple[Floats, Floats]:
-    """Return the largest and the mean change of the rays' colours in each step of a path of n cameras.
+) -> Changes:
+    """Return how much the colours of rays change along a path.
 
-    The channel that changes most counts.
-
-    Returns
-    -------
-    largest, mean : ndarray of shape (n - 1,)
+    Parameters
+    ----------
+    method : str
+        One of ``METHODS``.
+    primitives : Primitives
+    colors : ndarray of shape (N, 3)
+    path : sequence of Camera
+        At least three.
+    rays : sequence of ndarray of shape (P, 3)
+        World frame, for each camera.
+    conventions : Conventions
     """
-    seen = np.stack([ray_colors(method, primitives, colors, camera, rays, conventions) for camera in path])
-    changes = np.abs(np.diff(seen, axis=0)).max(axis=2)  # [n - 1, P]
-    return changes.max(axis=1), changes.mean(axis=1)
+    seen = np.stack([ray_colors(method, primitives, colors, *at, conventions) for at in zip(path, rays, strict=True)])
+    steps = np.diff(seen, axis=0)  # [n - 1, P, 3]
+    changes = np.abs(steps).max(axis=2)
+    flicker = np.abs(np.diff(steps, axis=0)).max(axis=2).mean(axis=1).sum()
+    return Changes(changes.max(axis=1), changes.mean(axis=1), float(flicker))
