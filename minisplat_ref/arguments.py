@@ -124,7 +124,7 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
         choices=(*BACKENDS, CUDA),
         default=default,
         metavar="NAME",
-        help=f"cpu, cpu-exact, reference or, with an NVIDIA GPU, cuda (default {whose}cpu)",
+        help=f"cpu, cpu-exact, reference or cuda (default {whose}cpu)",
     )
 
 

@@ -172,6 +172,7 @@ notes = {
     "splatting": "one view of activated Gaussians",
     "backends": "one function for every stage",
     "stages": "what these functions take and return",
+    "cuda": "the same loops on a GPU",
     "cpu": "loops over all Gaussians, all pixels",
     "reference": "the formulas as matrices",
     "scalar": "the same for one Gaussian or pixel",

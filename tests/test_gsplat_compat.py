@@ -500,7 +500,7 @@ BAD_CALLS = {
     "render_mode 'rgb' is unknown; choose one of RGB, D, ED, RGB+D, RGB+ED": replace(render_mode="rgb"),
     "rasterize_mode 'mip' is unknown; choose one of classic, antialiased": replace(rasterize_mode="mip"),
     "profile 'inria' is unknown; choose one of GSPLAT_MAIN": replace(profile="inria"),
-    "backend 'cuda' is unknown; choose one of cpu": replace(backend="cuda"),
+    "backend 'metal' is unknown; choose one of cpu": replace(backend="metal"),
     "v_render_colors has shape [1, 18, 24, 3]; it must be [C, H, W, D], C = 2, H = 18, W = 24, D = 3": replace(
         v_render_colors=np.zeros((1, 18, 24, 3))
     ),
