@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
     check_suffix(args.out)
     kind = DepthKind(args.depth)
-    asked = Asked(args.folder, args.out, kind, args.voxel, args.unbounded, args.min_views, args.parts)
+    asked = Asked(args.folder, kind, args.voxel, args.unbounded, args.min_views, args.parts)
     opened = open_for_mesh(args.folder)
     meshed = mesh_run(opened, asked)
     write_mesh(args.out, meshed.mesh)

@@ -12,7 +12,11 @@ What a run records
 
 Afterwards
     :mod:`.evaluation` (``eval``: measure again), :mod:`.conversion` (``convert``), :mod:`.notices` (what a run can do
-    without, but should be told of).
+    without, but should be told of), :mod:`.model_file` (who draws a file, and what it lacks of its run).
+
+A mesh: what ``mesh`` does
+    :mod:`.depth_maps` (what a camera shows of the surface), :mod:`.meshing` (fused and extracted), :mod:`.mesh_report`,
+    :mod:`.mesh_study` (``study mesh``: how far meshes are from the true surface).
 
 A smaller model: what ``simplify`` does
     :mod:`.opened_run` (what is read of the run, and its folds of views), :mod:`.rate_distortion` (drop, standard error,

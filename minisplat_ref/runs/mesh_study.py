@@ -17,7 +17,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.viewpoints import scene_viewpoints
-from minisplat_ref.mechanisms.meshes.distances import SurfacePoints, compare_surfaces, sample_surface
+from minisplat_ref.mechanisms.meshes.distances import OrientedPoints, compare_surfaces, sample_surface
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.reporting import markdown_table
@@ -34,6 +34,7 @@ TAU = 0.05  # world units, metres of these scenes
 VOXELS = (0.02, 0.04, 0.08)
 DEPTH_VOXEL = 0.04  # at which the kinds of depth are compared
 N_POINTS = 100_000  # drawn on the mesh, and of the truth
+_SHARES = {"f_score": 3, "normal_error": 1}  # columns of the table that are no lengths, with their digits
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     return kit.Report(result, draw(records, args.recipes), f"{text}\n\n{markdown_table(heading, rows)}")
 
 
-def true_surface(made: SyntheticScene) -> SurfacePoints:
+def true_surface(made: SyntheticScene) -> OrientedPoints:
     """Return points of the surfaces that the views show."""
     views = (*made.scene.train_views, *made.scene.test_views)
     depths = np.concatenate([made.train_depths, made.test_depths])
@@ -67,7 +68,7 @@ def true_surface(made: SyntheticScene) -> SurfacePoints:
         directions.append(normal[y, x])
     every, rng = np.concatenate(points), np.random.default_rng(0)
     chosen = rng.choice(len(every), min(N_POINTS, len(every)), replace=False)
-    return SurfacePoints(every[chosen], np.concatenate(directions)[chosen])
+    return OrientedPoints(every[chosen], np.concatenate(directions)[chosen])
 
 
 def train_run(made: SyntheticScene, name: str, iterations: int, seed: int) -> Opened:
@@ -82,13 +83,13 @@ def train_run(made: SyntheticScene, name: str, iterations: int, seed: int) -> Op
     return Opened(trained, views, FILE_FRAME)
 
 
-def measure_meshes(opened: Opened, truth: SurfacePoints) -> list[dict[str, Any]]:
+def measure_meshes(opened: Opened, truth: OrientedPoints) -> list[dict[str, Any]]:
     """Return the distances of meshes by every voxel and, at one, by every depth."""
     settings = [(DepthKind.MEDIAN, voxel) for voxel in VOXELS]
     settings += [(kind, DEPTH_VOXEL) for kind in DepthKind if kind is not DepthKind.MEDIAN]
     records = []
     for kind, voxel in kit.with_progress(settings, "meshes"):
-        mesh = mesh_run(opened, Asked(Path("run"), Path("mesh.ply"), kind, voxel)).mesh
+        mesh = mesh_run(opened, Asked(Path("run"), kind, voxel)).mesh
         found = sample_surface(mesh.vertices, mesh.faces, N_POINTS, np.random.default_rng(0))
         distances = compare_surfaces(found, truth, TAU)
         records.append({"depth": kind.value, "voxel": voxel, **distances._asdict(), "chamfer": distances.chamfer})
@@ -109,9 +110,6 @@ def to_rows(records: list[dict[str, Any]], recipes: tuple[str, ...]) -> list[lis
             shares = [with_deviation([record[key] for record in of_seeds], d) for key, d in _SHARES.items()]
             rows.append([recipe, depth, f"{voxel:g}", *lengths, *shares])
     return rows
-
-
-_SHARES = {"f_score": 3, "normal_error": 1}
 
 
 def draw(records: list[dict[str, Any]], recipes: tuple[str, ...]) -> Figure:

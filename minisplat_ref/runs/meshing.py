@@ -20,7 +20,6 @@ from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest, marching_cubes_package
 from minisplat_ref.mechanisms.fusion.kernels import fuse
 from minisplat_ref.mechanisms.fusion.volume import BOUND, Contraction, DepthMap, Grid, empty_volume
-from minisplat_ref.mechanisms.meshes.files import check_suffix
 from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.depth_maps import DepthKind, depth_map
@@ -39,7 +38,6 @@ class Asked(NamedTuple):
     """What the command line says."""
 
     run: Path
-    out: Path
     depth: DepthKind = DepthKind.MEDIAN
     voxel: float | None = None
     """In the unit of the scene's files, for a contracted grid of the part that is not contracted."""
@@ -98,10 +96,9 @@ def mesh_run(opened: Opened, asked: Asked) -> Meshed:
     Raises
     ------
     InputError
-        No view shows a surface, the grid does not fit into memory, the renderer has no such depth, the name of the
-        file is none of a mesh, or a package is missing.
+        No view shows a surface, the grid does not fit into memory, the renderer has no such depth, or scikit-image is
+        not installed.
     """
-    check_suffix(asked.out)
     marching_cubes_package()
     unit = opened.frame.unit
     places = _find_surface(opened, asked.depth)

@@ -64,7 +64,7 @@ def test_a_run_becomes_a_mesh_and_a_page(run, tmp_path, capsys):
 def test_the_surface_is_where_the_depths_are(kind, run):
     """Points that a camera's depth shows lie on the mesh, half of them within one and a half voxels of a vertex."""
     opened = open_for_mesh(run)
-    asked = Asked(run, run / "x.ply", kind, voxel=0.1)
+    asked = Asked(run, kind, voxel=0.1)
     meshed = mesh_run(opened, asked)
     view = opened.views[0]
     depth, camera = opened.map_of(view, kind).depth, opened.camera_of(view)
@@ -87,14 +87,14 @@ def test_without_bounds_it_reaches_further(run, tmp_path, capsys):
 def test_the_mesh_is_in_the_frame_of_the_files(run):
     """A run that is rendered in another frame gives the same mesh, moved and scaled, and the voxel is in its unit."""
     opened = open_for_mesh(run)
-    here = mesh_run(opened, Asked(run, run / "x.ply", voxel=0.1))
+    here = mesh_run(opened, Asked(run, voxel=0.1))
     frame = Frame((1000.0, -50.0, 3.0), 2.0)
-    there = mesh_run(opened._replace(frame=frame), Asked(run, run / "x.ply", voxel=0.2))
+    there = mesh_run(opened._replace(frame=frame), Asked(run, voxel=0.2))
     assert_allclose(there.mesh.vertices, 2 * here.mesh.vertices + frame.origin, rtol=CLOSED_FORM)
     assert (there.voxel, there.shape) == (pytest.approx(0.2), here.shape)
-    asked = Asked(run, run / "x.ply")
+    asked, name = Asked(run), run / "x.ply"
     moved = opened._replace(frame=frame)
-    pages = (report_html(moved, asked, there, asked.out), report_html(opened, asked, here, asked.out))
+    pages = (report_html(moved, asked, there, name), report_html(opened, asked, here, name))
     ours, theirs = (re.findall('data:image[^"]*', page) for page in pages)
     assert len(ours) == 12 and ours == theirs
 

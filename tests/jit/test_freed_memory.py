@@ -1,7 +1,7 @@
 """Kernels free what they allocate: Numba counts the arrays that compiled code holds.
 
-A generator of compiled code never frees the arrays that it holds, which cost trainings with the plain kernels a
-megabyte in every iteration.
+A generator of compiled code never frees the arrays that it holds; trainings with the plain kernels once filled the
+memory in this way.
 """
 
 import numpy as np

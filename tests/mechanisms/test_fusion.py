@@ -246,5 +246,5 @@ def test_a_ply_far_from_the_origin_keeps_its_place(tmp_path):
 
 
 def test_another_name_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"mesh\.stl is not named like a mesh: .*\.ply, \.obj, \.glb"):
+    with pytest.raises(InputError, match=r"mesh\.stl is not named like a mesh: .*\.ply, \.glb, \.obj"):
         check_suffix(tmp_path / "mesh.stl")

@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.mechanisms.meshes.distances import SurfacePoints, compare_surfaces, sample_surface
+from minisplat_ref.mechanisms.meshes.distances import OrientedPoints, compare_surfaces, sample_surface
 
 
 def grid(x_max, z, normal=(0.0, 0, 1)):
     """Points a hundredth apart in ``[0, x_max] x [0, 1]`` at a height."""
     x, y = np.meshgrid(np.arange(0.005, x_max, 0.01), np.arange(0.005, 1, 0.01))
     points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
-    return SurfacePoints(points, np.tile(normal, (len(points), 1)))
+    return OrientedPoints(points, np.tile(normal, (len(points), 1)))
 
 
 def test_a_plane_beside_a_plane():

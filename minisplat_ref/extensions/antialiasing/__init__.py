@@ -14,8 +14,9 @@ The standard deviation of the spatial filter is a further field, ``filter_sigmas
 measures it at the first iteration and then every 100 iterations. A filter of 0 renders the Gaussians as they are,
 bit for bit.
 
-The filter is measured from centres in front of a camera's image and 15 % around it, as in the released code, and a new
-Gaussian has its parent's filter until it is measured. A recipe of the core that is trained with
+Resets lower the opacities that are seen through the filter in space. The filter is measured from centres in front of a
+camera's image and 15 % around it, as in the released code, and a new Gaussian has its parent's filter until it is
+measured. A recipe of the core that is trained with
 ``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a Gaussian
 over a pixel, is the extension ``analytic``; ``docs/FAMILY.md`` has the figures of both.
 

@@ -50,8 +50,9 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The model or the name of the mesh cannot be used, trimesh is needed and missing, or a number is out of range.
     """
-    from minisplat_ref.extensions.fans.mesh_files import check_suffix, write_mesh
+    from minisplat_ref.extensions.fans.mesh_files import write_mesh
     from minisplat_ref.extensions.fans.shapes import mesh_of, visible_mesh
+    from minisplat_ref.mechanisms.meshes.files import check_suffix
 
     check_suffix(args.out)
     if not 0 <= args.min_opacity <= 1:

@@ -23,27 +23,13 @@ from minisplat_ref.io.label import Label, to_comments
 from minisplat_ref.io.ply import COLORS, MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import property_names, read_vertices, write_vertices
+from minisplat_ref.mechanisms.meshes.files import check_suffix, trimesh_package
 from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh, check_translucent, to_bytes
 from minisplat_ref.types import Floats
 
-SUFFIXES = (".ply", ".glb", ".obj")
 BYTES = (*COLORS, "alpha")
 FLOATS = ("rgba_0", "rgba_1", "rgba_2", "rgba_3")
 LABEL = Label("fans")
-
-
-def check_suffix(path: Path) -> None:
-    """Refuse a name that says no format, or one that needs a package that is not installed.
-
-    Raises
-    ------
-    InputError
-        One line that says which suffixes there are, or how to install trimesh.
-    """
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path} is not named like a mesh: give a name that ends in {', '.join(SUFFIXES)}")
-    if path.suffix.lower() != ".ply":
-        _trimesh()
 
 
 def write_mesh(path: Path, mesh: TranslucentMesh) -> None:
@@ -52,13 +38,13 @@ def write_mesh(path: Path, mesh: TranslucentMesh) -> None:
     Raises
     ------
     InputError
-        The suffix is none of ``SUFFIXES``, trimesh is not installed, or the file cannot be written.
+        As for :func:`minisplat_ref.mechanisms.meshes.files.check_suffix`, or the file cannot be written.
     """
     check_suffix(path)
     if path.suffix.lower() == ".ply":
         write_vertices(path, _columns(mesh.vertices, to_bytes(mesh.rgba)), mesh.faces)
         return
-    trimesh = _trimesh()
+    trimesh = trimesh_package()
     material = trimesh.visual.material.PBRMaterial(alphaMode="BLEND", doubleSided=True)
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=to_bytes(mesh.rgba), process=False)
     if path.suffix.lower() == ".obj":
@@ -67,24 +53,6 @@ def write_mesh(path: Path, mesh: TranslucentMesh) -> None:
     solid.visual = trimesh.visual.TextureVisuals(material=material)
     solid.visual.vertex_attributes["color"] = to_bytes(mesh.rgba)
     write_content(path, solid.export(file_type="glb"))
-
-
-def _trimesh() -> Any:
-    """Return the package.
-
-    Raises
-    ------
-    InputError
-        It is not installed.
-    """
-    try:
-        import trimesh
-    except ImportError:
-        raise InputError(
-            "glTF and OBJ are written by trimesh, which is not installed: pip install 'minisplat_ref[meshes]', or write"
-            " a .ply"
-        ) from None
-    return trimesh
 
 
 def save_fans(path: str | Path, fans: Fans, label: Label = LABEL) -> None:

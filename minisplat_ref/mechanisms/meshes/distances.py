@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from minisplat_ref.types import Floats, Ints
 
 
-class SurfacePoints(NamedTuple):
+class OrientedPoints(NamedTuple):
     """Points of a surface with its normals there."""
 
     points: Floats
@@ -43,7 +43,7 @@ class Distances(NamedTuple):
         return (self.accuracy + self.completeness) / 2
 
 
-def sample_surface(vertices: Floats, faces: Ints, n: int, rng: np.random.Generator) -> SurfacePoints:
+def sample_surface(vertices: Floats, faces: Ints, n: int, rng: np.random.Generator) -> OrientedPoints:
     """Draw n points on a mesh, uniformly by area.
 
     Parameters
@@ -63,10 +63,10 @@ def sample_surface(vertices: Floats, faces: Ints, n: int, rng: np.random.Generat
     is_beyond = a + b > 1  # the other half of the parallelogram
     a, b = np.where(is_beyond, 1 - a, a), np.where(is_beyond, 1 - b, b)
     points = p0[chosen] + a * (p1 - p0)[chosen] + b * (p2 - p0)[chosen]
-    return SurfacePoints(points, across[chosen] / areas[chosen, None])
+    return OrientedPoints(points, across[chosen] / areas[chosen, None])
 
 
-def compare_surfaces(found: SurfacePoints, truth: SurfacePoints, tau: float) -> Distances:
+def compare_surfaces(found: OrientedPoints, truth: OrientedPoints, tau: float) -> Distances:
     """Return the distances between points of a mesh and of the true surface; ``tau`` in world units."""
     to_truth, nearest = cKDTree(truth.points).query(found.points)
     to_found, _ = cKDTree(found.points).query(truth.points)

@@ -11,7 +11,7 @@ from minisplat_ref.io.ply import COLORS, MEANS
 from minisplat_ref.io.ply_file import write_vertices
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
 
-SUFFIXES = (".ply", ".obj", ".glb")
+SUFFIXES = (".ply", ".glb", ".obj")
 
 
 def check_suffix(path: Path) -> None:
