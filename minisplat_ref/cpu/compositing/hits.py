@@ -39,7 +39,7 @@ def composite_hits(
     forward_kernel(_find_shared(response), n_channels)(
         KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
         background,
-        _lists(bins, response),
+        lists_of(bins, response),
         frame_of(bins, conventions, dtype),
         n_threads(),
         _pixels(image, alpha, dtype),
@@ -63,7 +63,7 @@ def composite_hits_vjp(
     v_backgrounds = np.zeros((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(_find_shared(response), n_channels)(
         KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
-        _lists(bins, response),
+        lists_of(bins, response),
         frame_of(bins, conventions, dtype),
         n_threads(),
         _pixels(output.image, output.alpha, dtype),
@@ -80,7 +80,8 @@ def composite_hits_vjp(
     )
 
 
-def _lists(bins: TileBins, response: KernelResponse) -> Lists:
+def lists_of(bins: TileBins, response: KernelResponse) -> Lists:
+    """Return the lists of the tiles in the form that plain kernels take."""
     size = bins.grid.tile_width, bins.grid.tile_height
     return Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots, *size, response.buffer_size)
 

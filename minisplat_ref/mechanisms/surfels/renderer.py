@@ -1,0 +1,223 @@
+"""A renderer of surfels, and its gradient: colours, normals, depths and what distortion is made of as channels."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.compositing import hits as kernel_hits
+from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
+from minisplat_ref.mechanisms.surfels.kernels import response_for
+from minisplat_ref.mechanisms.surfels.projection import (
+    PAPER,
+    SurfelGradient,
+    Surfels,
+    centers_moved,
+    project,
+    project_vjp,
+)
+from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
+from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
+from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
+from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, choose_degree
+from minisplat_ref.types import (
+    BlendGradient,
+    Camera,
+    Floats,
+    Gaussians,
+    Ints,
+    Model,
+    Primitives,
+    RenderOutput,
+    TileBins,
+    TileGrid,
+    View,
+)
+
+CHANNELS = {"depth": 1, "normal": 3, "spread": 2, "median": 1}
+"""The channels beside ``rgb`` in their order, and how many each has. The median is the last: it is not blended."""
+STATISTICS = frozenset({"stats"})  # by the reference alone
+
+
+class Shown(NamedTuple):
+    """A view of surfels after projection and shading, ready to be blended."""
+
+    surfels: Surfels
+    colors: Floats
+    """[N, D] what is the same on a whole surfel; 0 in channels of depths."""
+    background: Floats
+    """[D]."""
+    bins: TileBins
+    conventions: Conventions
+    backend: Backend
+    layout: Layout
+
+    def blend(self, **asked: bool) -> RenderOutput:
+        """Return the image, blended by kernels or by the reference."""
+        inputs = self.surfels, self.colors, self.background, self.bins, self.conventions
+        if self.backend.is_compiled:
+            return kernel_hits.composite_hits(response_for(self.colors.dtype, self.surfels, self.layout), *inputs)
+        return composite_hits(surfel_response(self.layout), *inputs, **asked)
+
+    def blend_vjp(self, output: RenderOutput, v_image: Floats, v_alpha: Floats) -> BlendGradient:
+        """Gradient of :meth:`blend`."""
+        inputs = self.surfels, self.colors, self.background, self.bins, self.conventions, output, (v_image, v_alpha)
+        if self.backend.is_compiled:
+            return kernel_hits.composite_hits_vjp(response_for(self.colors.dtype, self.surfels, self.layout), *inputs)
+        return composite_hits_vjp(surfel_response(self.layout), *inputs)
+
+    def measure_rays(self) -> RayMeasures:
+        """Return median depths and gsplat's distortion."""
+        if self.backend.is_compiled:
+            return ray_kernels.measure_rays(self.surfels, self.bins, self.conventions, self.colors.dtype)
+        return ray_measures.measure_rays(self.surfels, self.bins, self.conventions)
+
+    def measure_rays_vjp(self, measures: RayMeasures, v_median: Floats, v_distortion: Floats) -> tuple[Floats, ...]:
+        """Gradient of :meth:`measure_rays` with respect to transforms, means2d, opacities and depths."""
+        module: Any = ray_kernels if self.backend.is_compiled else ray_measures
+        fields: tuple[Floats, ...] = module.measure_rays_vjp(
+            self.surfels, self.bins, self.conventions, measures, v_median, v_distortion
+        )
+        return fields
+
+
+def list_tiles(surfels: Surfels, camera: Camera, conventions: Conventions, backend: Backend) -> TileBins:
+    """Return the surfels of every tile, nearest centres first."""
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    return backend.bin_gaussians(surfels.listed, grid, conventions)
+
+
+class SurfelTape(NamedTuple):
+    """What :func:`render` keeps for :func:`render_vjp`."""
+
+    gaussians: Any
+    primitives: Primitives
+    camera: Camera
+    sh_degree: int | Ints  # active
+    shown: Shown
+    blended: RenderOutput
+    measures: RayMeasures | None
+    slices: dict[str, slice]
+
+
+def channels(wants: frozenset[str]) -> dict[str, slice]:
+    """Return the image's channels by name."""
+    slices, first = {"rgb": slice(0, 3)}, 3
+    for name, size in CHANNELS.items():
+        if name in wants:
+            slices[name] = slice(first, first + size)
+            first += size
+    return slices
+
+
+def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, SurfelTape]:
+    """Render a view of surfels.
+
+    Parameters
+    ----------
+    model : Model
+        A population that has the six fields of :class:`Gaussians`; the third scale is not read.
+    view : View
+        Its camera is used.
+    request : Request
+        Wants: ``depth``, ``sum w z`` with the depths of the hits; ``normal``, ``sum w n`` in the camera's frame,
+        towards the camera; ``spread``, ``sum w q`` and ``sum w q^2`` of
+        :class:`~minisplat_ref.mechanisms.surfels.response.Layout`; ``median``, the median depth as a channel with a
+        gradient; ``median_depth``, the same in the output.
+
+    Returns
+    -------
+    output : RenderOutput
+    tape : SurfelTape
+
+    Raises
+    ------
+    InputError
+        Something is wanted that surfels do not have, or the conventions ask for compensated opacities.
+    """
+    g, camera, conventions, backend = model.gaussians, view.camera, request.conventions, request.backend
+    missing = request.wants - CHANNELS.keys() - {"median_depth"} - (frozenset() if backend.is_compiled else STATISTICS)
+    if missing:
+        way_out = "use --backend reference" if missing <= STATISTICS else "train a recipe that does without"
+        raise InputError(f"surfels are drawn without {', '.join(sorted(missing))}: {way_out}")
+    if conventions.is_antialiased:
+        raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
+    dtype, slices = g.means.dtype, channels(request.wants)
+    sh_degree = choose_degree(g.sh_rest, request.sh_degree)
+    primitives = activate(g, request.is_visible)
+    surfels = project(primitives, camera, conventions, PAPER)
+    parts = {"rgb": backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, surfels.radii)}
+    for name in slices:
+        if name not in ("rgb", "median"):
+            parts[name] = surfels.normals if name == "normal" else np.zeros((len(surfels.depths), CHANNELS[name]))
+    colors = np.column_stack(list(parts.values())).astype(dtype)
+    background = np.zeros(colors.shape[1], dtype)
+    if request.background is not None:
+        background[:3] = request.background
+    layout = Layout(*(slices[name].start if name in slices else None for name in ("depth", "spread")))
+    bins = list_tiles(surfels, camera, conventions, backend)
+    shown = Shown(surfels, colors, background, bins, conventions, backend, layout)
+    asked = {"with_stats": True} if "stats" in request.wants else {}
+    blended = shown.blend(**asked)
+    measures = shown.measure_rays() if request.wants & {"median", "median_depth"} else None
+    image = blended.image
+    if measures is not None and "median" in slices:
+        image = np.concatenate([image, measures.median[:, :, None].astype(dtype)], axis=2)
+    output = blended._replace(
+        image=image,
+        median_depth=None if measures is None else measures.median.astype(dtype),
+        visible_ids=np.flatnonzero(surfels.radii[:, 0] > 0),
+        n_pairs=len(bins.gaussian_ids),
+    )
+    return output, SurfelTape(g, primitives, camera, sh_degree, shown, blended, measures, slices)
+
+
+def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render`, by the chain rule.
+
+    ::
+
+        v_log_s = s v_s,  v_logit = o (1 - o) v_o
+
+    The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
+    """
+    g, shown, slices, camera = tape.gaussians, tape.shown, tape.slices, tape.camera
+    n_blended = shown.colors.shape[1]
+    v_alpha = np.zeros_like(tape.blended.alpha) if v_alpha is None else v_alpha
+    v = shown.blend_vjp(tape.blended, np.ascontiguousarray(v_image[:, :, :n_blended]), v_alpha)
+    v_fields = v.primitives
+    if tape.measures is not None and "median" in slices:
+        v_median = np.ascontiguousarray(v_image[:, :, n_blended])
+        v_rays = shown.measure_rays_vjp(tape.measures, v_median, np.zeros_like(v_median))
+        v_fields = tuple(a + b for a, b in zip(v_fields, v_rays, strict=True))
+    v_normals = v.colors[:, slices["normal"]] if "normal" in slices else np.zeros_like(g.means)
+    v_surfels = SurfelGradient(*v_fields, v_normals)
+    v_primitives = project_vjp(tape.primitives, camera, shown.conventions, shown.surfels, v_surfels)
+    v_rgb = np.ascontiguousarray(v.colors[:, :3])
+    v_sh = shown.backend.sh_colors_vjp(
+        g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, shown.surfels.radii, v_rgb
+    )
+    with np.errstate(over="ignore"):
+        transparencies = 1 / (1 + np.exp(g.opacity_logits))
+    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}
+    return RenderGradient(
+        gaussians=g._replace(
+            means=v_primitives.means + v_sh.means,
+            quats=v_primitives.quats,
+            log_scales=tape.primitives.scales * v_primitives.scales,
+            opacity_logits=tape.primitives.opacities * transparencies * v_primitives.opacities,
+            sh_dc=v_sh.sh_dc,
+            sh_rest=v_sh.sh_rest,
+            **further,
+        ),
+        background=v.background[:3],
+        cam_from_world_R=v_primitives.cam_from_world_R + v_sh.cam_from_world_R,
+        cam_from_world_t=v_primitives.cam_from_world_t + v_sh.cam_from_world_t,
+        means2d=centers_moved(v_surfels, shown.surfels).astype(g.means.dtype),
+    )
+
+
+SURFELS = Renderer("surfels", render, render_vjp, channels)
+"""2D Gaussian Splatting: any population that has the six fields of :class:`Gaussians`."""
