@@ -153,7 +153,7 @@ def project(
         boxes=np.where(row, boxes, 0).astype(np.int32),
         rules=rules,
         near_plane=conventions.near_plane,
-        pivot=float(np.median(1 / x[is_visible, 2])) if is_visible.any() else 0.0,
+        pivot=_pivot(x[is_visible, 2]),
     )
 
 
@@ -256,6 +256,14 @@ def _transforms(means: Floats, quats: Floats, scales: Floats, camera: Camera) ->
 
 def _intrinsics(camera: Camera) -> Floats:
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def _pivot(depths: Floats) -> float:
+    """Return the median inverse depth, rounded to three bits: a constant that does not follow the surfels."""
+    if len(depths) == 0:
+        return 0.0
+    mantissa, exponent = np.frexp(np.median(1 / depths))
+    return float(np.ldexp(np.rint(8 * mantissa) / 8, exponent))
 
 
 def _visible_boxes(

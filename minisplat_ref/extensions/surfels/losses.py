@@ -1,0 +1,75 @@
+"""The two losses of 2D Gaussian Splatting, equations (13) and (14): depth distortion and normal consistency.
+
+With the hits of a pixel of weights w_i, the mapped depths m_i, the normals n_i and the surface normal N from the
+neighbouring pixels' depths::
+
+    L_d = mean over pixels of sum_{i<j} w_i w_j (m_i - m_j)^2,   m = far / (far - near) (1 - near / z)
+    L_n = mean over pixels of sum_i w_i (1 - <n_i, N>) = mean of A - <sum_i w_i n_i, N>
+
+The paper writes |m_i - m_j|; the square is what its code has. For L_n the code has ``1 - <sum_i w_i n_i, A N>`` with A
+held constant, which no finite difference can check; this is the paper's. Of the renderer's channel ``spread``, S_1 = sum w q and
+S_2 = sum w q^2, it is ``b^2 (A S_2 - S_1^2)`` with ``b = far near / (far - near)``, because m = const - b q up to sign.
+"""
+
+import numpy as np
+
+from minisplat_ref.mechanisms.surfels.depth_normals import central_normals, central_normals_vjp
+from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
+from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
+from minisplat_ref.types import Floats
+
+NEAR, FAR = 0.2, 100.0  # world units: between which depths are mapped to [0, 1], as released
+
+
+def distortion(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return L_d and its derivatives: ``v_A = S_2``, ``v_S_1 = -2 S_1``, ``v_S_2 = A``, times b^2 / pixels."""
+    spread, A = rendered.channel("spread"), rendered.output.alpha
+    S_1, S_2 = spread[..., 0], spread[..., 1]
+    scale = A.dtype.type((FAR * NEAR / (FAR - NEAR)) ** 2 / A.size)
+    value = float(scale * np.sum(A * S_2 - S_1 * S_1, dtype=np.float64))
+    return value, Cotangents({"spread": scale * np.stack([-2 * S_1, A], axis=2)}, scale * S_2)
+
+
+def normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return L_n with the surface through the expected depths.
+
+    ``v_A = 1 / pixels``, ``v_n = -N / pixels``, and ``v_N = -n / pixels`` on through the normals to the depths.
+    """
+    sums, alpha = rendered.channel("depth")[..., 0], rendered.output.alpha
+    value, v_normal, v_depth = _disagree(rendered, expected_depth(sums, alpha))
+    v_sums, v_alpha = expected_depth_vjp(sums, alpha, v_depth)
+    return value, Cotangents({"normal": v_normal, "depth": v_sums[..., None]}, v_alpha + _v_opacity(alpha))
+
+
+def median_normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return L_n with the surface through the median depths, which the paper prefers for bounded scenes."""
+    value, v_normal, v_depth = _disagree(rendered, rendered.channel("median")[..., 0])
+    v_alpha = _v_opacity(rendered.output.alpha)
+    return value, Cotangents({"normal": v_normal, "median": v_depth[..., None]}, v_alpha)
+
+
+def _disagree(rendered: Rendered, depth: Floats) -> tuple[float, Floats, Floats]:
+    """Return L_n, and its derivatives with respect to the blended normals and the depth.
+
+    There is no N beside a pixel without hits, which has no depth.
+    """
+    A, camera = rendered.output.alpha, rendered.view.camera
+    is_hit, has_normal = A > 0, np.zeros(A.shape, bool)
+    has_normal[1:-1, 1:-1] = is_hit[2:, 1:-1] & is_hit[:-2, 1:-1] & is_hit[1:-1, 2:] & is_hit[1:-1, :-2]
+    n = np.where(has_normal[..., None], rendered.channel("normal"), 0)
+    N, share = central_normals(depth, camera), A.dtype.type(1 / A.size)
+    value = float(share * np.sum(A - np.sum(n * N, axis=2), dtype=np.float64))
+    return value, -share * np.where(has_normal[..., None], N, 0), central_normals_vjp(depth, camera, -share * n)
+
+
+def _v_opacity(alpha: Floats) -> Floats:
+    return np.full_like(alpha, 1 / alpha.size)
+
+
+# Weights and dates of the released code: of 30,000 iterations. The distortion's weight is 0 there by default, 10 to 100
+# for most scenes and 1,000 for DTU, whose unit is a millimetre.
+LOSSES = (
+    LossTerm("normal_consistency", normal_consistency, 0.05, frozenset({"normal", "depth"}), start=7_000),
+    LossTerm("median_normal_consistency", median_normal_consistency, 0.0, frozenset({"normal", "median"}), start=7_000),
+    LossTerm("distortion", distortion, 0.0, frozenset({"spread"}), start=3_000),
+)

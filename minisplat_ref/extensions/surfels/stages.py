@@ -1,0 +1,24 @@
+"""The stages of the gradient check: the renderer with all its channels, rays, and normals from depths."""
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.extensions.surfels.method import DISCS
+from minisplat_ref.mechanisms.surfels.depth_normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.surfels.stages import rays_stage, renderer_stage
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return them; normals from depths are NumPy on every backend."""
+    depth = rng.uniform(2, 3, size=(6, 7))
+    normals = Stage(
+        "central_normals",
+        {"depth": depth},
+        ("normals",),
+        lambda z: Point((central_normals(z, setting.camera),)),
+        lambda v: (central_normals_vjp(depth, setting.camera, v),),
+    )
+    return renderer_stage(backend, setting, DISCS, rng), rays_stage(backend, setting, rng), normals
