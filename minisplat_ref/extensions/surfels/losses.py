@@ -54,7 +54,7 @@ def _disagree(rendered: Rendered, depth: Floats) -> tuple[float, Floats, Floats]
     There is no N beside a pixel without hits, which has no depth.
     """
     A, camera = rendered.output.alpha, rendered.view.camera
-    is_hit, has_normal = A > 0, np.zeros(A.shape, bool)
+    is_hit, has_normal = A > rendered.request.conventions.alpha_min / 2, np.zeros(A.shape, bool)
     has_normal[1:-1, 1:-1] = is_hit[2:, 1:-1] & is_hit[:-2, 1:-1] & is_hit[1:-1, 2:] & is_hit[1:-1, :-2]
     n = np.where(has_normal[..., None], rendered.channel("normal"), 0)
     N, share = central_normals(depth, camera), A.dtype.type(1 / A.size)
