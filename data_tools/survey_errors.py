@@ -46,7 +46,7 @@ _CALL = (
     ),
     PlantedLine("colours of all cameras to the first", "gsplat_compat:_batch_vjp", "v_colors[c] if", "v_colors[0] if"),
     PlantedLine(
-        "camera's centre by the transpose", "gsplat_compat:_remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"
+        "camera's centre by the transpose", "gsplat_compat:remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"
     ),
     PlantedLine("depths over white", "splatting:splat", "background.dtype.type(0)", "background.dtype.type(1)"),
     PlantedLine(

@@ -319,7 +319,7 @@ def render_one(batch: Batch, c: int, conventions: Conventions, backend: Backend)
         if batch.options.sh_degree is None:
             return colors
         return backend.sh_colors(
-            means, *_split(colors), _remove_rotation(batch.cameras[c]), batch.options.sh_degree, radii
+            means, *_split(colors), remove_rotation(batch.cameras[c]), batch.options.sh_degree, radii
         )
 
     return splat(
@@ -352,7 +352,7 @@ def render_one_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alp
     elif batch.options.sh_degree is None:
         v_colors = v.colors
     else:
-        unrotated = _remove_rotation(tape.camera)
+        unrotated = remove_rotation(tape.camera)
         dc, rest = _split(batch.colors_of(c))
         v_sh = tape.backend.sh_colors_vjp(
             batch.primitives.means, dc, rest, unrotated, batch.options.sh_degree, tape.projection.radii, v.colors
@@ -486,7 +486,7 @@ def _stack(arrays: list[Floats]) -> Floats:
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-def _remove_rotation(camera: Camera) -> Camera:
+def remove_rotation(camera: Camera) -> Camera:
     """Return a camera at the same centre with R = I: colours depend on the centre only."""
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     return camera._replace(cam_from_world_R=np.eye(3), cam_from_world_t=np.linalg.solve(R, t))
