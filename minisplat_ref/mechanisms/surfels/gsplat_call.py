@@ -19,7 +19,7 @@ from minisplat_ref.constants import GSPLAT_1_5, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.gsplat_arguments import TILE_SIZE, Batch, Options, Views, split_batches
 from minisplat_ref.gsplat_compat import remove_rotation
-from minisplat_ref.mechanisms.surfels.depth_normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.surfels.depth_normals import LENGTH_MIN, central_normals, central_normals_vjp
 from minisplat_ref.mechanisms.surfels.projection import GSPLAT, SurfelGradient, Surfels, project, project_vjp
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.renderer import Shown, list_tiles
@@ -265,11 +265,16 @@ def _render_one(batch: Batch, c: int, asked: Asked) -> OneView:
     surface = np.zeros_like(normals)
     if options.has_colors and options.has_depth:
         depth = measures.median.astype(dtype) if asked.reads_median else image[..., -1]
-        surface = steps.normals_of(depth, camera) @ to_world
+        surface = _unit(steps.normals_of(depth, camera) @ camera.cam_from_world_R.astype(dtype))
     distortion = measures.distortion.astype(dtype) if asked.has_distortion else np.zeros_like(blended.alpha)
     columns = (blended.alpha, distortion, measures.median.astype(dtype))
     alpha, distortion, median = (column[..., None] for column in columns)
     return OneView(shown, primitives, blended, measures, (image, alpha, normals @ to_world, surface, distortion, median))
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Return vectors of length one; zeros stay."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), LENGTH_MIN)
 
 
 def _colors(batch: Batch, c: int, asked: Asked, radii: Ints) -> Floats:
@@ -308,19 +313,21 @@ def _add_view_vjp(
 ) -> None:
     """Add the gradient of view c to ``v``: the chain rule over the steps of :func:`_render_one` in reverse.
 
-    World normals are ``R^-1 n``, as in gsplat, whatever R: ``v_n = R^-T v_w``, and ``v_R = -R^-T v_w w^T``. Spherical
-    harmonics add, via the camera's centre ``o = -R^-1 t``, ``v_R = -u o^T`` and ``v_t = -u`` with ``u = R^-T v_o``.
+    World normals are ``w = R^-1 n``, as in gsplat, whatever R: ``v_n = R^-T v_w``, ``v_R = -R^-T v_w w^T``. Those of the
+    surface are unit vectors along ``R^T n``, because gsplat takes the cross product in the world. Spherical harmonics add, via the camera's centre ``o = -R^-1 t``, ``v_R = -u o^T`` and ``v_t = -u`` with ``u = R^-T v_o``.
     """
     camera, options, steps, dtype = batch.cameras[c], batch.options, asked.steps, batch.primitives.means.dtype
     v_image, v_alpha, v_normals, v_surface, v_distortion, v_median = v_images
     R, n_colors = camera.cam_from_world_R.astype(dtype), v_image.shape[2]
-    v_surface, v_normals = (v_world @ np.linalg.inv(R) for v_world in (v_surface, v_normals))  # in the camera's frame
+    v_normals = v_normals @ np.linalg.inv(R)  # in the camera's frame
     v_image, v_alpha, v_median = v_image.copy(), v_alpha[..., 0], v_median[..., 0]
     v_R = np.zeros((3, 3), dtype)
     if options.has_colors and options.has_depth:
         depth = view.measures.median.astype(dtype) if asked.reads_median else view.images[0][..., -1]
-        v_R -= np.einsum("hwi,hwj->ij", v_surface, view.images[3])
-        v_depth = central_normals_vjp(depth, camera, v_surface)
+        n = view.images[3]
+        v_turned = v_surface - n * np.sum(n * v_surface, axis=2, keepdims=True)
+        v_R += np.einsum("hwi,hwj->ij", steps.normals_of(depth, camera), v_turned)
+        v_depth = central_normals_vjp(depth, camera, v_turned @ R.T)
         if asked.reads_median:
             v_median = v_median + v_depth
         else:

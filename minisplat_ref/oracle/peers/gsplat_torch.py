@@ -255,8 +255,8 @@ def _composite(
     pixels, ids = _hits(projection, bins, conventions._replace(alpha_max=ALPHA_MAX))
     width, height = bins.grid.width, bins.grid.height
     nerfacc = ModuleType("nerfacc")
-    nerfacc.render_weight_from_alpha = _weights  # type: ignore[attr-defined]
-    nerfacc.accumulate_along_rays = _sums  # type: ignore[attr-defined]
+    nerfacc.render_weight_from_alpha = ray_weights  # type: ignore[attr-defined]
+    nerfacc.accumulate_along_rays = ray_sums  # type: ignore[attr-defined]
     with patch.dict(sys.modules, {"nerfacc": nerfacc}):  # accumulate imports it when called
         image, alpha = gsplat.accumulate(
             means2d[None],
@@ -284,7 +284,7 @@ def _hits(projection: Projection, bins: TileBins, conventions: Conventions) -> t
     return torch.from_numpy(np.concatenate(pixels)), torch.from_numpy(np.concatenate(ids))
 
 
-def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
+def ray_weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
     """Return weight and transmittance of each hit, as running products over a table with a row for each pixel."""
     torch, _ = load()
     is_first = torch.ones_like(ray_indices, dtype=torch.bool)
@@ -297,7 +297,8 @@ def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, 
     return alphas * transmittances, transmittances
 
 
-def _sums(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
+def ray_sums(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
+    """Return the sums [n_rays, D] of the hits' weights times values, or of the weights alone."""
     torch, _ = load()
     terms = weights[:, None] if values is None else weights[:, None] * values
     return torch.zeros((n_rays, terms.shape[1]), dtype=weights.dtype).index_add(0, ray_indices, terms)
