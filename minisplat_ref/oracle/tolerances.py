@@ -77,6 +77,11 @@ EXPECTED_DEPTH = StageTolerance(COMPARE_FLOAT64, 1e-4, "a depth is divided by al
 SURFACE = StageTolerance(COMPARE_FLOAT64, 1e-4, "Sigma^-1 multiplies rounding by its condition number")
 # ... and a few roundings of values of order 1.
 ADAM = StageTolerance(COMPARE_FLOAT64, 2e-6, "a few roundings of each value")
+# Of surfels: a depth or a colour, a difference of depths that nearly cancels, and a quotient of such differences.
+SURFEL_DEPTH = StageTolerance(COMPARE_FLOAT64, 5e-5, "a depth is divided by alpha, hundreds of hits each rounded")
+SURFEL_DISTORTION = StageTolerance(COMPARE_FLOAT64, 2e-4, "z_i A_i - M_i is a difference of nearly equal numbers")
+SURFEL_NORMAL = StageTolerance(COMPARE_FLOAT64, 2e-3, "differences of neighbouring depths, divided by their length")
+SURFEL_HARD = StageTolerance(1e-10, 2e-5, "grazing rays multiply rounding by the inverse of the angle")
 
 # Of two weights in a pixel that are as near as this part of the larger, rounding decides which is the largest: they are
 # products of hundreds of factors, each rounded to 6e-8.

@@ -35,6 +35,20 @@ def add_parser(commands: Commands) -> None:
         check.add_parser(checks)
 
 
+SURFELS_CALL = "rasterization_2dgs"
+
+
+def add_call_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``--call NAME``."""
+    parser.add_argument(
+        "--call",
+        choices=("rasterization", SURFELS_CALL),
+        default="rasterization",
+        metavar="NAME",
+        help="the call of gsplat's: rasterization (default), or rasterization_2dgs for 2D Gaussian Splatting",
+    )
+
+
 def add_json_argument(parser: argparse._ActionsContainer) -> None:
     """Add ``--json FILE``."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the cases to FILE")

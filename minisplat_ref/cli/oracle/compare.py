@@ -3,7 +3,7 @@
 import argparse
 
 from minisplat_ref.arguments import Commands, HelpFormatter
-from minisplat_ref.cli.oracle import add_output_arguments, publish
+from minisplat_ref.cli.oracle import SURFELS_CALL, add_call_argument, add_output_arguments, publish
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 
@@ -57,6 +57,9 @@ examples:
   minisplat-ref oracle compare planted:half-off-diagonal --scene ordinary
   minisplat-ref oracle compare profile:INRIA --scene sh3 --json differences.json
 
+of 2D Gaussian Splatting, on its own scenes (ordinary, median, hard):
+  minisplat-ref oracle compare my_module:my_function --call rasterization_2dgs
+
 your own renderer, in three lines:
   minisplat-ref oracle export golden
   YOUR_PROGRAM golden mine      # reads golden/SCENE/*.npz, writes mine/SCENE/*.npz
@@ -106,12 +109,15 @@ def add_parser(checks: Commands) -> None:
         metavar="KIND",
         help="what a function is called with: numpy, torch or jax (default: what its module imports)",
     )
+    add_call_argument(parser)
     add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Compare every scene, print the table of stages."""
+    if args.call == SURFELS_CALL:
+        return _compare_surfels(args)
     from minisplat_ref.oracle.comparison.renderers import choose_function, choose_renderer, choose_scenes, is_function
     from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 
@@ -137,4 +143,25 @@ def run(args: argparse.Namespace) -> int:
         print(f"not given: {', '.join(report.settings['not_given'])}")
     if left_out:
         print(f"left out, since {renderer.name} follows other conventions or rounds: {', '.join(left_out)}")
+    return code
+
+
+def _compare_surfels(args: argparse.Namespace) -> int:
+    """Do the same for ``rasterization_2dgs``, and name the first stage that differs."""
+    from minisplat_ref.mechanisms.surfels.oracle.comparison import choose_renderer, compare, truth
+    from minisplat_ref.mechanisms.surfels.oracle.scenes import scenes
+
+    if args.against != "reference" or args.profile is not None:
+        raise InputError(f"{SURFELS_CALL} has one profile and is compared with the reference: leave the option out")
+    known = {scene.name: scene for scene in scenes()}
+    if args.scene not in ("all", *known):
+        raise InputError(f"scene {args.scene!r} is unknown; choose all or one of {', '.join(known)}")
+    renderer = choose_renderer(args.backend, args.dtype, args.arrays)
+    chosen = known if args.scene == "all" else {args.scene: known[args.scene]}
+    report = compare(renderer, {name: (scene, truth(scene)) for name, scene in chosen.items()})
+    code = publish(report, args)
+    if report.settings["first_difference"] is not None:
+        print(f"first difference: {report.settings['first_difference']}")
+    if report.settings["not_given"]:
+        print(f"not given: {', '.join(report.settings['not_given'])}")
     return code

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from minisplat_ref.arguments import Commands, HelpFormatter
+from minisplat_ref.cli.oracle import SURFELS_CALL, add_call_argument
 
 DESCRIPTION = """\
 Write golden vectors: the inputs, outputs, cotangents and gradients of every
@@ -17,7 +18,8 @@ EPILOG = """\
 example:
   minisplat-ref oracle export golden    # 9 scenes, 3 MB
   YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine
-  minisplat-ref oracle compare mine     # names the first stage that differs"""
+  minisplat-ref oracle compare mine     # names the first stage that differs
+  minisplat-ref oracle export golden_2dgs --call rasterization_2dgs"""
 
 
 def add_parser(checks: Commands) -> None:
@@ -30,11 +32,18 @@ def add_parser(checks: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument("out", type=Path, metavar="DIR", help="new folder")
+    add_call_argument(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the folder and check it by reading it."""
+    if args.call == SURFELS_CALL:
+        from minisplat_ref.mechanisms.surfels.oracle import files
+
+        names = ", ".join(scene.name for scene in files.export(args.out))
+        print(f"wrote {args.out}: scenes {names}; start with {args.out / 'README.md'}")
+        return 0
     from minisplat_ref.oracle.golden.files import export, load
     from minisplat_ref.oracle.golden.scenes import golden_scenes
 

@@ -7,8 +7,9 @@ neighbouring pixels' depths::
     L_n = mean over pixels of sum_i w_i (1 - <n_i, N>) = mean of A - <sum_i w_i n_i, N>
 
 The paper writes |m_i - m_j|; the square is what its code has. For L_n the code has ``1 - <sum_i w_i n_i, A N>`` with A
-held constant, which no finite difference can check; this is the paper's. Of the renderer's channel ``spread``, S_1 = sum w q and
-S_2 = sum w q^2, it is ``b^2 (A S_2 - S_1^2)`` with ``b = far near / (far - near)``, because m = const - b q up to sign.
+held constant, which no finite difference can check; this is the paper's. With S_1 = sum w q and S_2 = sum w q^2, the
+renderer's channel ``spread``, the sum in L_d is ``b^2 (A S_2 - S_1^2)``, ``b = far near / (far - near)``, because m is
+``const - b q``.
 """
 
 import numpy as np

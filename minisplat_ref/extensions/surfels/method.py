@@ -8,7 +8,7 @@ from minisplat_ref.extensions.surfels.losses import LOSSES
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, prune_faint
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.training.schedule import Every
+from minisplat_ref.training.schedule import Event, Every
 from minisplat_ref.types import Gaussians
 
 LOG_THICKNESS = -16.0  # 1e-7 world units: what other programs draw, and where children of a split are placed
@@ -26,7 +26,7 @@ def as_surfels(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
 DISCS = Representation("surfels", extend=as_surfels, renderer=SURFELS)
 
 
-def _with_opacity_min(event: object) -> object:
+def _with_opacity_min(event: Event) -> Event:
     """Return the event; pruning of faint Gaussians with the released bound."""
     if isinstance(event, Every) and getattr(event.action, "func", None) is prune_faint:
         return event._replace(action=partial(prune_faint, min_opacity=OPACITY_MIN))

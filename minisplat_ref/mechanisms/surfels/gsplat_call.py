@@ -46,6 +46,10 @@ class Steps(NamedTuple):
     normals_of: Callable[[Floats, Camera], Floats] = central_normals
 
 
+STEPS = Steps()
+"""Those of gsplat."""
+
+
 class Asked(NamedTuple):
     """What a call asks for beside the options of every call."""
 
@@ -89,7 +93,7 @@ def rasterization_2dgs(
     distloss: bool = False,
     depth_mode: str = "expected",
     backend: str | Backend = "cpu",
-    steps: Steps = Steps(),
+    steps: Steps = STEPS,
     **others: Any,
 ) -> tuple[Floats, Floats, Floats, Floats | None, Floats, Floats, dict[str, Any]]:
     """Render surfels through C cameras.
@@ -139,7 +143,9 @@ def rasterization_2dgs(
     lead, batches = split_batches((means, quats, scales, opacities), None, colors, views, backgrounds, options)
     shown = [_render_one(batch, c, asked) for batch in batches for c in range(len(batch.cameras))]
     front = (*lead, len(batches[0].cameras))
-    images = [np.stack(image).reshape(*front, *image[0].shape) for image in zip(*(s.images for s in shown), strict=True)]
+    images = [
+        np.stack(image).reshape(*front, *image[0].shape) for image in zip(*(s.images for s in shown), strict=True)
+    ]
     fields = ("radii", "means2d", "depths", "opacities", "normals")
     stacked = {name: np.stack([getattr(s.shown.surfels, name) for s in shown]) for name in fields}
     stacked["depths"] = np.stack([s.shown.surfels.transforms[:, 2, 2] for s in shown])
@@ -175,7 +181,7 @@ def rasterization_2dgs_vjp(
     distloss: bool = False,
     depth_mode: str = "expected",
     backend: str | Backend = "cpu",
-    steps: Steps = Steps(),
+    steps: Steps = STEPS,
     **others: Any,
 ) -> dict[str, Floats]:
     """Gradient of :func:`rasterization_2dgs`; renders the views once more.
@@ -190,8 +196,8 @@ def rasterization_2dgs_vjp(
     Returns
     -------
     dict of ndarray
-        ``v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmats``, and ``v_backgrounds`` where there are some, in
-        the shapes of the arguments. The third scale's are 0.
+        ``v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmats``, and ``v_backgrounds`` where there are some,
+        in the shapes of the arguments. The third scale's are 0.
     """
     asked = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
     options = Options(sh_degree, render_mode, False, tile_size, radius_clip)
@@ -269,7 +275,9 @@ def _render_one(batch: Batch, c: int, asked: Asked) -> OneView:
     distortion = measures.distortion.astype(dtype) if asked.has_distortion else np.zeros_like(blended.alpha)
     columns = (blended.alpha, distortion, measures.median.astype(dtype))
     alpha, distortion, median = (column[..., None] for column in columns)
-    return OneView(shown, primitives, blended, measures, (image, alpha, normals @ to_world, surface, distortion, median))
+    return OneView(
+        shown, primitives, blended, measures, (image, alpha, normals @ to_world, surface, distortion, median)
+    )
 
 
 def _unit(vectors: Floats) -> Floats:
@@ -313,8 +321,9 @@ def _add_view_vjp(
 ) -> None:
     """Add the gradient of view c to ``v``: the chain rule over the steps of :func:`_render_one` in reverse.
 
-    World normals are ``w = R^-1 n``, as in gsplat, whatever R: ``v_n = R^-T v_w``, ``v_R = -R^-T v_w w^T``. Those of the
-    surface are unit vectors along ``R^T n``, because gsplat takes the cross product in the world. Spherical harmonics add, via the camera's centre ``o = -R^-1 t``, ``v_R = -u o^T`` and ``v_t = -u`` with ``u = R^-T v_o``.
+    World normals are ``w = R^-1 n``, as in gsplat, whatever R: ``v_n = R^-T v_w``, ``v_R = -R^-T v_w w^T``. Those of
+    the surface are unit vectors along ``R^T n``, because gsplat takes the cross product in the world. Spherical
+    harmonics add, via the camera's centre ``o = -R^-1 t``, ``v_R = -u o^T`` and ``v_t = -u`` with ``u = R^-T v_o``.
     """
     camera, options, steps, dtype = batch.cameras[c], batch.options, asked.steps, batch.primitives.means.dtype
     v_image, v_alpha, v_normals, v_surface, v_distortion, v_median = v_images

@@ -212,7 +212,12 @@ def project_vjp(
     v_quats = rotation_matrices_vjp(quats, v_rotations)
     v_t = v_A[:, :, 2].sum(axis=0)
     return PrimitiveGradient(
-        *(scatter(v) for v in (v_B[:, :, 2], v_quats, v_scales, v_o)), v_R.astype(dtype), v_t.astype(dtype)
+        means=scatter(v_B[:, :, 2]),
+        quats=scatter(v_quats),
+        scales=scatter(v_scales),
+        opacities=scatter(v_o),
+        cam_from_world_R=v_R.astype(dtype),
+        cam_from_world_t=v_t.astype(dtype),
     )
 
 

@@ -29,7 +29,18 @@ from minisplat_ref.cpu.compositing.pixel_rows import (
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.cpu.compositing.tile_state import frame_of
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, accumulate, broadcast, gather, load, reduce_any, reduce_sum, scatter, select, store
+from minisplat_ref.jit.lanes import (
+    WIDTH,
+    accumulate,
+    broadcast,
+    gather,
+    load,
+    reduce_any,
+    reduce_sum,
+    scatter,
+    select,
+    store,
+)
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
 from minisplat_ref.mechanisms.surfels.kernels import response_for

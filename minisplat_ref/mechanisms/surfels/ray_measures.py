@@ -3,7 +3,8 @@
 With the weights w_i and depths z_i of a pixel's hits, front to back, and ``T_i`` the transmittance in front of hit i::
 
     median     = z_i of the last hit with T_i > 1/2, 0 where there is none
-    distortion = sum_ij w_i w_j |z_i - z_j| = 2 sum_i w_i (z_i A_i - M_i),   A_i = sum_{j<i} w_j,  M_i = sum_{j<i} w_j z_j
+    distortion = sum_ij w_i w_j |z_i - z_j| = 2 sum_i w_i (z_i A_i - M_i)
+    A_i        = sum_{j<i} w_j,   M_i = sum_{j<i} w_j z_j
 
 The second form holds where depths never fall along the ray; where they do, gsplat computes it all the same, and so do
 we. It is the distortion of Mip-NeRF 360; that of 2D Gaussian Splatting squares the difference and needs no order (see
@@ -16,7 +17,7 @@ import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
 from minisplat_ref.mechanisms.surfels.projection import Surfels
-from minisplat_ref.mechanisms.surfels.response import FIELDS, surfel_response, Layout
+from minisplat_ref.mechanisms.surfels.response import FIELDS, Layout, surfel_response
 from minisplat_ref.reference.hits import TileHits, tile_hits
 from minisplat_ref.types import Floats, Ints, TileBins
 

@@ -54,12 +54,12 @@ class Shown(NamedTuple):
     backend: Backend
     layout: Layout
 
-    def blend(self, **asked: bool) -> RenderOutput:
-        """Return the image, blended by kernels or by the reference."""
+    def blend(self, with_stats: bool = False) -> RenderOutput:
+        """Return the image, blended by kernels or by the reference, which also collects blend statistics."""
         inputs = self.surfels, self.colors, self.background, self.bins, self.conventions
         if self.backend.is_compiled:
             return kernel_hits.composite_hits(response_for(self.colors.dtype, self.surfels, self.layout), *inputs)
-        return composite_hits(surfel_response(self.layout), *inputs, **asked)
+        return composite_hits(surfel_response(self.layout), *inputs, with_stats=with_stats)
 
     def blend_vjp(self, output: RenderOutput, v_image: Floats, v_alpha: Floats) -> BlendGradient:
         """Gradient of :meth:`blend`."""
@@ -159,8 +159,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Su
     layout = Layout(*(slices[name].start if name in slices else None for name in ("depth", "spread")))
     bins = list_tiles(surfels, camera, conventions, backend)
     shown = Shown(surfels, colors, background, bins, conventions, backend, layout)
-    asked = {"with_stats": True} if "stats" in request.wants else {}
-    blended = shown.blend(**asked)
+    blended = shown.blend(with_stats="stats" in request.wants)
     measures = shown.measure_rays() if request.wants & {"median", "median_depth"} else None
     image = blended.image
     if measures is not None and "median" in slices:
@@ -193,12 +192,11 @@ def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None)
         v_rays = shown.measure_rays_vjp(tape.measures, v_median, np.zeros_like(v_median))
         v_fields = tuple(a + b for a, b in zip(v_fields, v_rays, strict=True))
     v_normals = v.colors[:, slices["normal"]] if "normal" in slices else np.zeros_like(g.means)
-    v_surfels = SurfelGradient(*v_fields, v_normals)
+    v_T, v_c, v_o, v_z = v_fields
+    v_surfels = SurfelGradient(v_T, v_c, v_o, v_z, v_normals)
     v_primitives = project_vjp(tape.primitives, camera, shown.conventions, shown.surfels, v_surfels)
     v_rgb = np.ascontiguousarray(v.colors[:, :3])
-    v_sh = shown.backend.sh_colors_vjp(
-        g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, shown.surfels.radii, v_rgb
-    )
+    v_sh = shown.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, shown.surfels.radii, v_rgb)
     with np.errstate(over="ignore"):
         transparencies = 1 / (1 + np.exp(g.opacity_logits))
     further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}

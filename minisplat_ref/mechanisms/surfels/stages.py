@@ -47,7 +47,7 @@ def rays_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> 
     inputs = {**primitives._asdict(), "depths": depths, **setting.pose}
 
     def shown_of(named: dict[str, Floats]) -> tuple[Primitives, Shown]:
-        moved = camera._replace(**{name: named[name] for name in POSE})
+        moved = camera._replace(cam_from_world_R=named[POSE[0]], cam_from_world_t=named[POSE[1]])
         p = Primitives(*(named[name] for name in Primitives._fields))
         surfels = project(p, moved, conventions, GSPLAT)
         bins = list_tiles(surfels, moved, conventions, REFERENCE)

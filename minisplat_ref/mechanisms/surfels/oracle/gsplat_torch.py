@@ -111,7 +111,7 @@ def _hits(
     torch, _ = load()
     M, K = viewmats[0].detach().numpy().astype(np.float64), Ks[0].numpy().astype(np.float64)
     camera = Camera(M[:3, :3], M[:3, 3], K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size)
-    conventions = GSPLAT_1_5._replace(**planes)
+    conventions = GSPLAT_1_5._replace(near_plane=planes["near_plane"], far_plane=planes["far_plane"])
     given = Primitives(*(x.detach().numpy().astype(np.float64) for x in primitives))
     surfels = project(given, camera, conventions, GSPLAT)
     bins = list_tiles(surfels, camera, conventions, REFERENCE)

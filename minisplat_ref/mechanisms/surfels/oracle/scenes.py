@@ -5,6 +5,7 @@ because gsplat's torch functions multiply normals by them and its kernels do not
 surfels: discs seen from the edge, at a grazing angle, behind the camera and across its plane, and smaller than a pixel.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,8 +62,10 @@ def _scene(
         "distloss": True,
         "depth_mode": depth_mode,
     }
-    images = rasterization_2dgs(**arguments, backend="reference")
-    cotangents = {f"v_{key}": _round(rng.normal(size=np.shape(image))) for key, image in zip(NAMES, images, strict=False)}
+    images: Sequence[Any] = rasterization_2dgs(**arguments, backend="reference")[:6]
+    cotangents = {
+        f"v_{key}": _round(rng.normal(size=np.shape(image))) for key, image in zip(NAMES, images, strict=True)
+    }
     return SurfelScene(name, what, arguments, cotangents)
 
 
@@ -91,7 +94,7 @@ def _ordinary(n: int, seed: int) -> tuple[dict[str, Floats], Floats]:
 
 def _hard() -> tuple[dict[str, Floats], Floats]:
     """Return the ordinary surfels with hard ones among them: see the module's docstring."""
-    surfels, viewmat = _ordinary(12, 5)
+    surfels, _ = _ordinary(12, 5)
     half = np.sqrt(0.5)
     edge_on, grazing = (half, 0.0, half, 0.0), (np.cos(0.783), 0.0, np.sin(0.783), 0.0)
     hard = [  # mean, quaternion, scale, opacity

@@ -1,0 +1,217 @@
+"""Surfels against answers from elsewhere: planes, a sphere, sums over pairs; kernels against the reference."""
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
+from minisplat_ref.mechanisms.surfels.depth_normals import central_normals
+from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, project
+from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS, list_tiles
+from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
+from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.rendering import Request, activate
+from minisplat_ref.types import Camera, Gaussians, Model, Primitives, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, SURFEL_FLOAT32_GRADIENT, SURFEL_PLANE
+
+WANTS = frozenset(CHANNELS)
+EDGE_ON = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+CAMERA = Camera(np.eye(3), np.zeros(3), 32.0, 30.0, 12.3, 9.1, 24, 18)
+
+
+def surfels_at(means, quats, scales, opacities):
+    """Gaussians of grey; a scale is that of both axes."""
+    n = len(means)
+    logits = np.log(np.asarray(opacities) / (1 - np.asarray(opacities)))
+    log_scales = np.repeat(np.log(np.asarray(scales, float))[:, None], 3, axis=1)
+    return Gaussians(
+        np.asarray(means, float), np.asarray(quats, float), log_scales, logits, np.zeros((n, 3)), np.zeros((n, 0, 3))
+    )
+
+
+def drawn(gaussians, camera=CAMERA, backend=REFERENCE, wants=WANTS):
+    output, tape = SURFELS.render(Model(gaussians), view_from(camera), Request(backend=backend, wants=wants))
+    return output, tape, SURFELS.channels(wants)
+
+
+def test_a_plane_has_the_depths_and_the_normal_of_a_plane(backend):
+    """The plane n . x = d is hit by the ray r at z = d / (n . r)."""
+    quat, mean = np.array([1.0, 0.2, -0.15, 0.4]), np.array([0.1, -0.2, 5.0])
+    output, tape, channels = drawn(surfels_at([mean], [quat], [1e3], [0.8]), backend=backend)
+    n = tape.shown.surfels.normals[0]
+    rays = pinhole_rays(np.arange(24) + 0.5, np.arange(18)[:, None] + 0.5, CAMERA)
+    z = (n @ mean) / (rays @ n)
+    assert n @ mean < 0 and np.ptp(z) > 0.5
+    alpha = output.alpha
+    assert_allclose(alpha, 0.8, rtol=1e-4)
+    assert_allclose(output.image[..., channels["depth"]][..., 0], alpha * z, rtol=SURFEL_PLANE)
+    assert_allclose(output.image[..., channels["normal"]], alpha[..., None] * n, rtol=SURFEL_PLANE, atol=1e-15)
+    assert_allclose(output.median_depth, z, rtol=SURFEL_PLANE)
+    assert_allclose(central_normals(z, CAMERA)[1:-1, 1:-1], np.broadcast_to(n, (16, 22, 3)), rtol=1e-9, atol=1e-12)
+
+
+def test_a_sphere_of_tangent_surfels_has_its_depths_and_normals(backend):
+    """A surfel where a pixel's ray meets the sphere, tangent there: depth and normal of the pixel are the sphere's."""
+    rays = pinhole_rays(np.arange(24) + 0.5, np.arange(18)[:, None] + 0.5, CAMERA)
+    center, radius = np.array([0.0, 0.0, 5.0]), 1.2
+    a, b, c = np.sum(rays * rays, axis=2), rays @ center, center @ center - radius**2
+    is_met = b * b > a * c
+    is_met[np.arange(18) % 4 > 0], is_met[:, np.arange(24) % 4 > 0] = False, False  # neighbours do not overlap
+    r, t = rays[is_met], ((b - np.sqrt(np.maximum(b * b - a * c, 0))) / a)[is_met]
+    points = t[:, None] * r
+    n = (points - center) / radius
+    quats = np.column_stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))])  # rotate z to n
+    quats[n[:, 2] < -1 + 1e-9] = (0, 1, 0, 0)
+    scales, opacities = np.full(len(n), 0.02), np.full(len(n), 0.9)
+    output, _, channels = drawn(surfels_at(points, quats, scales, opacities), backend=backend)
+    shown = output.image[is_met]
+    assert len(n) > 8 and np.ptp(t) > 0.4
+    assert_allclose(output.alpha[is_met], 0.9, rtol=1e-9)
+    assert_allclose(shown[:, channels["depth"]][:, 0], 0.9 * t, rtol=1e-9)
+    assert_allclose(shown[:, channels["normal"]], 0.9 * n, rtol=1e-9, atol=1e-9)
+    assert_allclose(output.median_depth[is_met], t, rtol=1e-9)
+
+
+def test_below_a_pixel_only_the_low_pass_is_left(backend):
+    """At d pixels from the centre alpha is o exp(-d^2), and the depth that of the centre."""
+    output, _, channels = drawn(surfels_at([[0.0, 0.0, 4.0]], [[1.0, 0.1, 0.2, 0]], [1e-7], [0.9]), backend=backend)
+    dx, dy = np.arange(24) + 0.5 - 12.3, np.arange(18)[:, None] + 0.5 - 9.1
+    alpha = 0.9 * np.exp(-(dx**2) - dy**2)
+    assert_allclose(output.alpha, np.where(alpha >= 1 / 255, alpha, 0), rtol=1e-7, atol=1e-15)
+    assert_allclose(output.image[..., channels["depth"]][..., 0], 4 * output.alpha, rtol=CLOSED_FORM)
+
+
+def test_seen_from_its_edge_a_disc_is_its_low_pass(backend):
+    output, _, _ = drawn(surfels_at([[0.0, 0.0, 4.0]], [EDGE_ON], [0.5], [0.9]), backend=backend)
+    y, x = 8, 11
+    assert_allclose(output.alpha[y, x], 0.9 * np.exp(-((x + 0.5 - 12.3) ** 2) - (y + 0.5 - 9.1) ** 2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_either_side_of_the_switch(side, backend):
+    """A disc that faces the camera: (u, v) = d z / (f s), and the low-pass is rho = 2 d^2; the smaller rho counts."""
+    f, z, d = 32.0, 4.0, 0.7  # px
+    s = z / (f * np.sqrt(2)) * (1 + 0.05 * side)  # world units: at the switch both are equal
+    camera = CAMERA._replace(fy=f, cx=12.5 - d, cy=9.5)
+    output, tape, _ = drawn(surfels_at([[0.0, 0.0, z]], [[1.0, 0, 0, 0]], [s], [0.9]), camera, backend)
+    c = tape.shown.surfels.means2d[0]
+    assert_allclose(c, (12.5 - d, 9.5), rtol=CLOSED_FORM)
+    rho = min((d * z / (f * s)) ** 2, 2 * d * d)
+    assert (rho < 2 * d * d) == (side == 1)
+    assert_allclose(output.alpha[9, 12], 0.9 * np.exp(-rho / 2), rtol=1e-9)
+
+
+def test_nothing_behind_the_camera_is_drawn(backend):
+    """The first disc lies behind; the plane of the second reaches behind, where the ray meets it at z < 0."""
+    quats = [[1.0, 0, 0, 0], [np.cos(0.7), 0, np.sin(0.7), 0]]
+    output, _, channels = drawn(
+        surfels_at([[0, 0, -3.0], [0.5, 0, 0.5]], quats, [1.0, 3.0], [0.9, 0.9]), backend=backend
+    )
+    is_hit = output.alpha > 0
+    depth = output.image[..., channels["depth"]][..., 0][is_hit] / output.alpha[is_hit]
+    assert is_hit.any() and depth.min() > GSPLAT_MAIN.near_plane
+
+
+def test_a_box_holds_all_that_is_visible(rng):
+    """Alpha is below its least outside of every box; large discs reach behind the camera."""
+    g = make_gaussians(rng, 40, size=0.5)
+    camera = make_camera(rng=rng)
+    surfels = project(activate(g), camera, GSPLAT_MAIN, PAPER)
+    ys, xs = np.mgrid[: camera.height, : camera.width]
+    found = surfel_response(Layout()).hit(surfels, np.arange(40), np.column_stack([xs.ravel(), ys.ravel()]) + 0.5)
+    x0, y0, x1, y1 = surfels.boxes[:, :, None].swapaxes(0, 1)
+    is_outside = ~((x0 <= xs.ravel()) & (xs.ravel() < x1) & (y0 <= ys.ravel()) & (ys.ravel() < y1))
+    is_seen = surfels.radii[:, :1] > 0
+    assert (is_outside & is_seen).any() and found.unclamped[is_outside & is_seen].max() < GSPLAT_MAIN.alpha_min
+
+
+@pytest.mark.parametrize(
+    ("dtype", "image_rel", "gradient_rel"),
+    [(np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64), (np.float32, PARITY_FLOAT32_IMAGE, SURFEL_FLOAT32_GRADIENT)],
+)
+@pytest.mark.parametrize("size", [0.15, 0.6])
+def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, size, rng):
+    g, camera = make_gaussians(rng, 40, size=size), make_camera(rng=rng)
+    (output, tape, _), (known, known_tape, _) = drawn(as_dtype(g, dtype), camera, CPU), drawn(g, camera)
+    assert_allclose(output.image, known.image, atol=image_rel * np.abs(known.image).max())
+    v_image, v_alpha = rng.normal(size=known.image.shape), rng.normal(size=known.alpha.shape)
+    v = SURFELS.render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
+    expected = SURFELS.render_vjp(known_tape, v_image, v_alpha)
+    pairs = [*zip(v.gaussians, expected.gaussians, strict=True), (v.means2d, expected.means2d)]
+    for got, want in [*pairs, (v.cam_from_world_R, expected.cam_from_world_R)]:
+        assert_allclose(got, want, atol=gradient_rel * np.abs(want).max())
+
+
+@pytest.mark.parametrize("rules", [PAPER, GSPLAT])
+@pytest.mark.parametrize("module", [ray_measures, ray_kernels])
+def test_what_rays_measure_is_a_sum_over_pairs(rules, module, rng):
+    """Pixel by pixel and pair by pair: distortion with |z_i - z_j|, hits in the order of their depths."""
+    camera = CAMERA
+    n = 12
+    means = np.column_stack([rng.uniform(-0.3, 0.3, (n, 2)), np.linspace(3, 6, n)])
+    p = Primitives(means, np.tile((1.0, 0.02, 0.01, 0), (n, 1)), np.full((n, 3), 0.4), rng.uniform(0.2, 0.9, n))
+    surfels = project(p, camera, GSPLAT_MAIN, rules)
+    bins = list_tiles(surfels, camera, GSPLAT_MAIN, REFERENCE)
+    extra = (np.dtype(float),) if module is ray_kernels else ()
+    measures = module.measure_rays(surfels, bins, GSPLAT_MAIN, *extra)
+    n_looked_at = 0
+    for tile in tile_hits(surfels, bins, GSPLAT_MAIN, surfel_response(Layout())):
+        for k in range(0, len(tile.ys), 7):
+            rows = np.flatnonzero(tile.alphas[:, k] > 0)
+            T, w, z = np.ones(1), [], tile.hit.depths[rows, k]
+            front = []
+            for alpha in tile.alphas[rows, k]:
+                front.append(T[0])
+                w.append(T[0] * alpha)
+                T = T * (1 - alpha)
+            pairs = sum(w[i] * w[j] * abs(z[i] - z[j]) for i, j in itertools.product(range(len(w)), repeat=2))
+            median = [z[i] for i in range(len(w)) if front[i] > 0.5][-1:] or [0.0]
+            at = tile.ys[k], tile.xs[k]
+            assert_allclose(measures.distortion[at], pairs, rtol=1e-9, atol=1e-14)
+            assert_allclose(measures.median[at], median[0], rtol=CLOSED_FORM)
+            n_looked_at += len(rows) > 2
+    assert n_looked_at > 5
+
+
+def test_spread_gives_the_squared_distortion_whatever_the_offset(rng):
+    """A S_2 - S_1^2 is the sum over pairs of w_i w_j (1 / z_i - 1 / z_j)^2."""
+    output, tape, channels = drawn(make_gaussians(rng, 30, size=0.4), make_camera(rng=rng))
+    S_1, S_2 = np.moveaxis(output.image[..., channels["spread"]], 2, 0)
+    got = output.alpha * S_2 - S_1**2
+    shown, n_looked_at = tape.shown, 0
+    for tile in tile_hits(shown.surfels, shown.bins, shown.conventions, surfel_response(shown.layout)):
+        w = tile.alphas * tile.transmittances[:-1]
+        for k in range(0, w.shape[1], 11):
+            q = 1 / tile.hit.depths[:, k]
+            pairs = np.sum(w[:, None, k] * w[None, :, k] * (q[:, None] - q) ** 2) / 2
+            assert_allclose(got[tile.ys[k], tile.xs[k]], pairs, rtol=1e-9, atol=1e-14)
+            n_looked_at += pairs > 1e-6
+    assert n_looked_at > 10
+
+
+def test_colors_are_those_of_the_harmonics_and_the_background_shines_through(backend):
+    g = surfels_at([[0, 0, 4.0]], [[1.0, 0, 0, 0]], [1e3], [0.75])
+    g = g._replace(sh_dc=np.array([[0.1, -0.2, 0.3]]))
+    request = Request(np.array([0.2, 0.4, 0.6]), backend=backend)
+    output, _ = SURFELS.render(Model(g), view_from(CAMERA), request)
+    expected = 0.75 * (0.5 + SH_C0 * g.sh_dc[0]) + 0.25 * request.background
+    assert_allclose(output.image[9, 12], expected, rtol=1e-5)
+
+
+def test_what_surfels_do_not_have_is_refused(rng):
+    model, view = Model(make_gaussians(rng, 3)), view_from(make_camera(rng=rng))
+    with pytest.raises(InputError, match="without surface: train a recipe"):
+        SURFELS.render(model, view, Request(wants=frozenset({"surface"})))
+    with pytest.raises(InputError, match="without stats: use --backend reference"):
+        SURFELS.render(model, view, Request(wants=frozenset({"stats"})))
+    with pytest.raises(InputError, match="leave the antialiased profile out"):
+        SURFELS.render(model, view, Request(conventions=GSPLAT_MAIN._replace(is_antialiased=True)))
+    output, _ = SURFELS.render(model, view, Request(wants=frozenset({"stats"}), backend=REFERENCE))
+    assert output.stats.hit_count.sum() > 0

@@ -1,0 +1,157 @@
+"""The oracle for ``rasterization_2dgs``: planted errors, hard cases, golden vectors, and gsplat's own torch functions."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from minisplat_ref.cli import main
+from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.surfels.gsplat_call import NAMES, rasterization_2dgs, rasterization_2dgs_vjp
+from minisplat_ref.mechanisms.surfels.oracle.comparison import STAGES, choose_renderer, compare, truth
+from minisplat_ref.mechanisms.surfels.oracle.hard_cases import CASES, run_surfel_cases, select
+from minisplat_ref.mechanisms.surfels.oracle.planted import PLANTED
+from minisplat_ref.mechanisms.surfels.oracle.scenes import scenes
+
+HAS_PEERS = all(importlib.util.find_spec(name) for name in ("torch", "gsplat"))
+
+
+@pytest.fixture(scope="module")
+def known():
+    return {scene.name: (scene, truth(scene)) for scene in scenes()}
+
+
+@pytest.mark.parametrize("error", PLANTED)
+def test_a_planted_error_is_named_at_its_stage(error, known):
+    report = compare(choose_renderer(f"planted:{error}"), known)
+    assert report.settings["first_difference"].partition(":")[0] == PLANTED[error].stage
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_kernels_agree_at_every_stage(dtype, known):
+    report = compare(choose_renderer("cpu", dtype), known)
+    assert len(report.cases) == len(STAGES) and report.n_failed == 0, report.cases
+    assert report.settings == {"first_difference": None, "not_given": []}
+
+
+@pytest.mark.skipif(not HAS_PEERS, reason="needs torch and gsplat: pip install 'minisplat_ref[peers]'")
+def test_gsplats_own_torch_functions_agree_in_every_result_and_gradient(known):
+    report = compare(choose_renderer("gsplat-torch"), known)
+    assert len(report.cases) == len(STAGES) and report.n_failed == 0, report.cases
+
+
+def test_hard_cases_have_the_answers_that_were_worked_out():
+    report = run_surfel_cases()
+    assert len(report.cases) == 3 * len(CASES) and report.n_failed == 0, report.cases
+
+
+def test_a_wrong_answer_is_found():
+    (case,) = select("faces the camera")
+    wrong = case._replace(alphas={pixel: value + 1e-3 for pixel, value in case.alphas.items()})
+    assert run_surfel_cases((wrong,)).n_failed == 3
+
+
+def test_every_cotangent_counts(known):
+    """Leaving one out changes the gradient, and cotangents add up."""
+    scene = known["ordinary"][0]
+    parts = [
+        rasterization_2dgs_vjp(**scene.arguments, cotangents={key: scene.cotangents[key]}, backend="cpu")["v_means"]
+        for key in scene.cotangents
+    ]
+    assert len(parts) == len(NAMES) and min(np.abs(part).max() for part in parts) > 1e-3
+    np.testing.assert_allclose(sum(parts), known["ordinary"][1]["v_means"], atol=1e-9)
+
+
+def test_a_batch_of_scenes_is_its_scenes_one_by_one(known):
+    one, other = (known[name][0].arguments for name in ("ordinary", "ordinary"))
+    moved = {**other, "means": other["means"] + 0.1}
+    arrays = [key for key, value in one.items() if isinstance(value, np.ndarray)]
+    both = {**one, **{key: np.stack([one[key], moved[key]]) for key in arrays}}
+    batched = rasterization_2dgs(**both)
+    for k, arguments in enumerate((one, moved)):
+        alone = rasterization_2dgs(**arguments)
+        for got, want in zip(batched[:6], alone[:6], strict=True):
+            np.testing.assert_array_equal(got[k], want)
+    cotangents = {key: np.stack([value, value]) for key, value in known["ordinary"][0].cotangents.items()}
+    v = rasterization_2dgs_vjp(**both, cotangents=cotangents)
+    np.testing.assert_allclose(v["v_means"][0], known["ordinary"][1]["v_means"], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"absgrad": True}, "absgrad=True is not computed"),
+        ({"packed": True}, "packed=True is not computed"),
+        ({"depth_mode": "mean"}, "depth_mode"),
+        ({"render_mode": "RGB"}, "distloss needs a depth"),
+        ({"opacities": np.full(61, 2.0)}, "opacities"),
+    ],
+)
+def test_what_is_not_computed_is_refused(change, message, known):
+    with pytest.raises(InputError, match=message):
+        rasterization_2dgs(**{**known["ordinary"][0].arguments, **change})
+
+
+def test_a_keyword_that_gsplat_does_not_have_is_a_programming_error(known):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'covars'"):
+        rasterization_2dgs(**known["ordinary"][0].arguments, covars=None)
+
+
+def test_a_wrong_cotangent_is_refused(known):
+    arguments = known["ordinary"][0].arguments
+    with pytest.raises(InputError, match="'v_render_depths' is unknown"):
+        rasterization_2dgs_vjp(**arguments, cotangents={"v_render_depths": np.zeros(1)})
+    with pytest.raises(InputError, match=r"v_render_alphas has shape \[1, 2\]"):
+        rasterization_2dgs_vjp(**arguments, cotangents={"v_render_alphas": np.zeros((1, 2))})
+
+
+def test_golden_vectors_and_a_renderer_of_ones_own(tmp_path, capsys, monkeypatch):
+    """Export, compare the folder with itself, and a function in a user's module, through the command line."""
+    golden = tmp_path / "golden"
+    assert main(["oracle", "export", str(golden), "--call", "rasterization_2dgs"]) == 0
+    assert {"README.md", "manifest.json", "ordinary", "median", "hard"} == {path.name for path in golden.iterdir()}
+    manifest = json.loads((golden / "manifest.json").read_text())
+    assert manifest["scenes"]["median"]["settings"]["depth_mode"] == "median"
+    assert manifest["tolerances"]["render_median"]["float64"] == 1e-9
+    compared = ["oracle", "compare", str(golden), "--call", "rasterization_2dgs", "--dtype", "float64"]
+    assert main(compared) == 0 and "all 18 cases passed" in capsys.readouterr().out
+
+    with np.load(golden / "hard" / "results.npz") as file:
+        arrays = dict(file)
+    arrays["render_normals"] = -arrays["render_normals"]
+    np.savez(golden / "hard" / "results.npz", **arrays)
+    assert main(compared) == 1 and "first difference: normals: render_normals" in capsys.readouterr().out
+
+    (tmp_path / "my_surfels.py").write_text(
+        "from minisplat_ref.mechanisms.surfels.gsplat_call import rasterization_2dgs as theirs\n"
+        "def rasterization_2dgs(**arguments):\n"
+        "    return theirs(**arguments)[:6]\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    call = ["oracle", "compare", "my_surfels:rasterization_2dgs", "--call", "rasterization_2dgs", "--scene", "median"]
+    assert main(call) == 0
+    out = capsys.readouterr().out
+    assert "all 6 cases passed" in out and "not given: radii, means2d" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare", "cpu", "--scene", "sh3"], "scene 'sh3' is unknown; choose all or one of ordinary, median, hard"),
+        (["compare", "planted:nothing"], "error 'nothing' is unknown"),
+        (["compare", "inria"], "'inria' is neither a folder of arrays nor a renderer of surfels"),
+        (["compare", "cpu", "--profile", "INRIA"], "leave the option out"),
+        (["hard-cases", "--only", "needle"], "no hard case holds 'needle'"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, capsys):
+    assert main(["oracle", *arguments, "--call", "rasterization_2dgs"]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_importing_the_oracle_of_surfels_imports_no_torch():
+    code = "import sys, minisplat_ref.mechanisms.surfels.oracle.comparison; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
