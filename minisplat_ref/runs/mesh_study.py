@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.viewpoints import scene_viewpoints
 from minisplat_ref.mechanisms.meshes.distances import OrientedPoints, compare_surfaces, sample_surface
@@ -86,7 +87,7 @@ def train_run(made: SyntheticScene, name: str, iterations: int, seed: int) -> Op
 def measure_meshes(opened: Opened, truth: OrientedPoints) -> list[dict[str, Any]]:
     """Return the distances of meshes by every voxel and, at one, by every depth."""
     settings = [(DepthKind.MEDIAN, voxel) for voxel in VOXELS]
-    settings += [(kind, DEPTH_VOXEL) for kind in DepthKind if kind is not DepthKind.MEDIAN]
+    settings += [(kind, DEPTH_VOXEL) for kind in DepthKind if kind is not DepthKind.MEDIAN and _has(opened, kind)]
     records = []
     for kind, voxel in kit.with_progress(settings, "meshes"):
         mesh = mesh_run(opened, Asked(Path("run"), kind, voxel)).mesh
@@ -94,6 +95,15 @@ def measure_meshes(opened: Opened, truth: OrientedPoints) -> list[dict[str, Any]
         distances = compare_surfaces(found, truth, TAU)
         records.append({"depth": kind.value, "voxel": voxel, **distances._asdict(), "chamfer": distances.chamfer})
     return records
+
+
+def _has(opened: Opened, kind: DepthKind) -> bool:
+    """Return whether the renderer of a run has a kind of depth; surfels have no dominant Gaussian."""
+    try:
+        opened.map_of(opened.views[0], kind)
+    except InputError:
+        return False
+    return True
 
 
 def to_rows(records: list[dict[str, Any]], recipes: tuple[str, ...]) -> list[list[str]]:

@@ -192,9 +192,9 @@ MESH = declare(
     argument(
         "--recipes",
         type=list_of(name),
-        default=("3dgs-accel", "mini-splatting2", "adaptive"),
+        default=("3dgs-accel", "mini-splatting2", "adaptive", "surfels"),
         metavar="R,Q",
-        help="names as in train --recipe (default 3dgs-accel,mini-splatting2,adaptive)",
+        help="names as in train --recipe (default 3dgs-accel,mini-splatting2,adaptive,surfels)",
     ),
     iterations(2000),
     SEEDS,

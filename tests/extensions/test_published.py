@@ -319,6 +319,14 @@ TABLES = {
     "pixel-order": GS_ACCEL | rows(f"{OURS}: exact by default", render__buffer_size=None),
     "polygons": GS_ACCEL,
     "rays": GS_ACCEL,
+    "surfels": {name: row for name, row in GS_ACCEL.items() if name != "prune_faint.min_opacity"}
+    | rows(
+        "2DGS, section 6.1 and released code",
+        normal_consistency=(0.05, 7_001),
+        median_normal_consistency=(0.0, 7_001),
+        distortion=(0.0, 3_001),
+        prune_faint__min_opacity=0.05,
+    ),
     "textured": GS_ACCEL
     | rows(f"{OURS}: between 3DGS's rates", rate__color_textures=0.000625, rate__opacity_textures=0.0125),
     "velocity": GS_ACCEL
@@ -339,6 +347,8 @@ CONSTANTS = [
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
+    ("surfels.losses", "NEAR", 0.2, "2DGS, released code"),
+    ("surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
     ("vr.foveation", "ACUITY_OFFSET", 0.02083333333, "Guenter et al. 2012"),
     ("vr.foveation", "ACUITY_SLOPE", 0.0275, "Guenter et al. 2012"),

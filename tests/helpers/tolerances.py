@@ -196,7 +196,7 @@ CUDA_FLOAT32_IMAGE = 2e-5
 # Gradients by the CUDA kernels in float32, as promised, relative to the largest; measured 1.3e-6 in the simulator.
 CUDA_FLOAT32_GRADIENT = 1e-4
 
-# The depth of a plane a thousand times as large as the image, whose map from the image to the disc has a condition of 1e4.
+# The depth of a plane a thousand times as large as the image: the map from image to disc has a condition of 1e4.
 SURFEL_PLANE = 1e-10
 
 # Gradients of surfels in float32, beside the 2e-5 of others: grazing hits divide by the angle, inverse depths by z^2.

@@ -1,4 +1,4 @@
-"""The oracle for ``rasterization_2dgs``: planted errors, hard cases, golden vectors, and gsplat's own torch functions."""
+"""The oracle for ``rasterization_2dgs``: planted errors, hard cases, golden vectors, gsplat's own torch functions."""
 
 import importlib.util
 import json
