@@ -28,8 +28,10 @@ __all__ = [
     "WARP",
     "GpuKernel",
     "check_device",
+    "check_room",
     "cuda",
     "device_function",
+    "free_bytes",
     "gpu_kernel",
     "is_simulated",
     "launch",
@@ -60,6 +62,27 @@ def check_device() -> None:
         found = False
     if not found:
         raise InputError("backend cuda found no NVIDIA GPU with a working driver; nvidia-smi should list one. Use cpu")
+
+
+def free_bytes() -> float:
+    """Return how much memory of the device is free; the simulator does not say, and so returns infinity."""
+    return float(cuda.current_context().get_memory_info().free)
+
+
+def check_room(n_bytes: float, what: str) -> None:
+    """Refuse what does not fit into the memory of the device, before it is allocated.
+
+    Raises
+    ------
+    InputError
+        It does not.
+    """
+    free = free_bytes()
+    if n_bytes > free:
+        raise InputError(
+            f"the GPU has no memory for {what}: {n_bytes / 1e9:.2f} GB are needed, {free / 1e9:.2f} GB are free; use"
+            " smaller images (--downscale), fewer Gaussians (--budget), or --backend cpu"
+        )
 
 
 class GpuKernel:

@@ -6,9 +6,10 @@ The lists are the reference's, byte for byte. The CPU's kernels also drop the ti
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cuda.arrays import empty, to_device, to_host
+from minisplat_ref.cuda.arrays import empty, is_on_device, to_device, to_host
 from minisplat_ref.cuda.sorting import sort_pairs
-from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch_rows
+from minisplat_ref.cuda.target import check_room, cuda, device_function, gpu_kernel, launch_rows
+from minisplat_ref.memory import BYTES_PER_PAIR
 from minisplat_ref.types import Projection, TileBins, TileGrid
 
 TILE = 16  # pixels, width and height: a block of 256 threads
@@ -55,9 +56,11 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     offsets = np.append(0, np.cumsum(to_host(counts)))  # [N + 1]
     depth_bits = projection.depths.view(np.int32 if projection.depths.dtype == np.float32 else np.int64)
     n_pairs = int(offsets[-1])
+    check_room(n_pairs * BYTES_PER_PAIR, f"{n_pairs:,} pairs (tile, Gaussian)")
     ids, tiles, bits = empty(n_pairs, np.int32), empty(n_pairs, np.int32), empty(n_pairs, depth_bits.dtype)
     launch_rows(write_pairs, n, boxes, to_device(depth_bits), to_device(offsets), grid.n_tiles_x, ids, tiles, bits)
     tiles_of_pairs = to_host(tiles)
     order = sort_pairs(tiles_of_pairs, to_host(bits))
     tile_offsets = np.append(0, np.cumsum(np.bincount(tiles_of_pairs, minlength=n_tiles)))
-    return TileBins(to_host(ids)[order], tile_offsets, order.astype(np.int32), offsets, grid)
+    bins = TileBins(to_host(ids)[order], tile_offsets, order.astype(np.int32), offsets, grid)
+    return to_device(bins) if is_on_device(projection.depths) else bins

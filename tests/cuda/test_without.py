@@ -54,7 +54,7 @@ def test_without_a_gpu_it_says_so():
 
 
 def test_the_names_of_all_backends_are_in_the_message():
-    with pytest.raises(InputError, match="cpu, cpu-exact, cuda, reference"):
+    with pytest.raises(InputError, match="cpu, cpu-exact, cuda, cuda-atomic, reference"):
         get_backend("gpu")
 
 

@@ -195,3 +195,7 @@ CUDA_FLOAT32_IMAGE = 2e-5
 
 # Gradients by the CUDA kernels in float32, as promised, relative to the largest; measured 1.3e-6 in the simulator.
 CUDA_FLOAT32_GRADIENT = 1e-4
+
+# Parameters and moments after three iterations: Adam divides by the root of the second moment, which enlarges rounding
+# where a gradient is near zero.
+CUDA_TRAINING = 1e-3
