@@ -19,9 +19,11 @@ __all__ = [
     "ALL",
     "activate",
     "chain",
+    "describe_device",
     "free_bytes",
     "has_wrong",
     "is_simulated",
+    "synchronize",
     "to_device",
     "to_host",
     "visible_widths",
@@ -30,7 +32,12 @@ __all__ = [
 
 ALL = 1 << 20  # numbers of a row to update: more than any row has
 is_simulated = target.is_simulated
-free_bytes = target.free_bytes
+free_bytes, describe_device = target.free_bytes, target.describe_device
+
+
+def synchronize() -> None:
+    """Wait until all kernels have run."""
+    cuda.synchronize()
 
 
 @gpu_kernel
