@@ -29,6 +29,7 @@ KERNEL_PARTS = {"gaussian_rows", "memory"}
 CPU_ONLY = {
     "projection.pose_of": "the point that the camera maps to 0, in float64; the reference adds t instead",
     "projection.constants_of": "conventions as float64 scalars",
+    "depth.intrinsics_of": "the camera's four numbers as an array",
     "compositing.composite_with": "the exponential is an argument, which compositing.exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
 }

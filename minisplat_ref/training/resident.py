@@ -180,7 +180,7 @@ class Residence:
         if "gaussians" not in state.__dict__:
             return
         self.gaussians = self.adam = None  # frees their memory first
-        camera, g, to_device = view.camera, state.gaussians, self.device.to_device
+        camera, g = view.camera, state.gaussians
         n, n_bytes = len(g.means), sum(field.nbytes for field in g)
         needs = memory.training_bytes(n, n_bytes, memory.PAIRS_PER_GAUSSIAN * n)
         needs += memory.IMAGE_BYTES * camera.width * camera.height
@@ -190,7 +190,7 @@ class Residence:
                 f" {needs / 1e9:.2f} GB are needed, {free / 1e9:.2f} GB are free; train on smaller photographs"
                 " (--downscale), by a recipe that keeps to a --budget, or with --backend cpu"
             )
-        adam = state.adam
+        adam, to_device = state.adam, self.device.to_device
         self.gaussians = to_device(g)
         self.adam = AdamState(to_device(adam.first), to_device(adam.second), adam.step, adam.joined)
 
