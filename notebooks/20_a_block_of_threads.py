@@ -86,9 +86,7 @@ figure.colorbar(shown, ax=panels[1], shrink=0.8)
 panels[2].barh(range(len(by_warp)), len(is_hit), color="#efebe4")
 panels[2].barh(range(len(by_warp)), by_warp, color=BLUE)
 panels[2].barh(range(len(by_warp)), last.reshape(-1, WARP).mean(1), color=YELLOW, height=0.35)
-panels[2].set(
-    title="last hit of a warp (blue), mean of its threads (yellow)", xlabel="place in the list", ylabel="warp"
-)
+panels[2].set(title="last hit: of a warp (blue), mean (yellow)", xlabel="place in the list", ylabel="warp")
 panels[2].invert_yaxis()
 
 # %% [markdown]

@@ -35,7 +35,11 @@ CPU_ONLY = {
 }
 
 # Backward formulas whose forward has another name, since one scalar function returns several things.
-FORWARD_OF = {"compositing.sigma_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
+FORWARD_OF = {
+    "compositing.sigma_vjp": "blend",
+    "projection.compensation_vjp": "project_gaussian",
+    "loss.photometric_vjp": "ssim_and_derivatives",
+}
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 ARGUMENTS_MAX = 8  # positional; what belongs together is a NamedTuple

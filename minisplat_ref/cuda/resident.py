@@ -12,7 +12,7 @@ from minisplat_ref.cuda.adam import list_on_device
 from minisplat_ref.cuda.arrays import empty, to_device, to_host, zeros
 from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.scalar.activation import log_scale_vjp, logit_vjp, opacity_of, scale_of
+from minisplat_ref.scalar.activation import opacity_of, opacity_of_vjp, scale_of, scale_of_vjp
 from minisplat_ref.types import Bools, Gaussians, Ints, PrimitiveGradient, Primitives, SHGradient
 
 __all__ = [
@@ -82,8 +82,8 @@ def chain_rows(
         return
     for k in range(3):
         v.means[n, k] += v_means[n, k]
-        v.scales[n, k] = log_scale_vjp(primitives.scales[n, k], v.scales[n, k])
-    v.opacities[n] = logit_vjp(primitives.opacities[n], opacity_logits[n], v.opacities[n])
+        v.scales[n, k] = scale_of_vjp(primitives.scales[n, k], v.scales[n, k])
+    v.opacities[n] = opacity_of_vjp(primitives.opacities[n], opacity_logits[n], v.opacities[n])
 
 
 def chain(gaussians: Gaussians, primitives: Primitives, v: PrimitiveGradient, v_sh: SHGradient) -> Gaussians:

@@ -12,18 +12,18 @@ def scale_of(log_scale, largest):
 
 
 @scalar
+def scale_of_vjp(scale, v_scale):
+    """Return v_log_s = s v_s."""
+    return scale * v_scale
+
+
+@scalar
 def opacity_of(logit):
     """Return o = 1 / (1 + exp(-logit))."""
     return ONE / (ONE + exp_of(-logit))
 
 
 @scalar
-def log_scale_vjp(scale, v_scale):
-    """Return v_log_s = s v_s."""
-    return scale * v_scale
-
-
-@scalar
-def logit_vjp(opacity, logit, v_opacity):
+def opacity_of_vjp(opacity, logit, v_opacity):
     """Return v_logit = o (1 - o) v_o; 1 - o is computed without the cancellation of 1 - 0.9999."""
     return opacity * (ONE / (ONE + exp_of(logit))) * v_opacity
