@@ -137,8 +137,8 @@ CUDA, CUDA_ATOMIC = "cuda", "cuda-atomic"
 def load_cuda() -> Backend:
     """Return the backend for an NVIDIA GPU; nothing imports CUDA before.
 
-    Every stage runs on the GPU; only the lists' pairs are sorted on the host. Results are where the data are: NumPy
-    arrays are copied to the GPU and back in each stage, arrays of the device stay there.
+    Results are where the data are: NumPy arrays are copied to the GPU and back in each stage, arrays of the device stay
+    there.
 
     Raises
     ------
