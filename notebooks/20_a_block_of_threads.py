@@ -124,6 +124,19 @@ show_code(plain.forward_kernel.__wrapped__)
 show_code(forward_kernel(np.dtype(np.float32), 3, False).function)
 
 # %% [markdown]
+# The picture shows all 256 threads from left to right, and the list from top to bottom: the block takes one line after
+# the other. Yellow is a hit. Everything else is a thread that computes an alpha and adds nothing.
+
+# %%
+steps = is_hit.reshape(len(is_hit), -1)
+figure, axis = plt.subplots(figsize=(9.5, 2.6))
+axis.imshow(steps, cmap="YlOrBr", vmin=-0.2, vmax=2.2, aspect="auto")
+for warp in range(1, len(by_warp)):
+    axis.axvline(warp * WARP - 0.5, color=BLUE, linewidth=1)
+axis.set(xlabel="thread; blue lines part the warps", ylabel="place in the list", title=f"{steps.mean():.0%} are hits")
+plt.show()
+
+# %% [markdown]
 # `read_batch` is why a block is worth it. Its threads copy 32 records together, wait until all have, and then read each
 # record 256 times from memory that is as near as registers.
 
@@ -177,6 +190,13 @@ v_truth = REFERENCE.composite_vjp(*arguments, truth, v_image, v_alpha)
 image_error = np.abs(output.image - truth.image).max()
 gradient_error = max(np.abs(a - b).max() / np.abs(b).max() for a, b in zip(v[:4], v_truth[:4], strict=True))
 print(f"image: {image_error:.0e}, gradients: {gradient_error:.0e} of the largest")
+figure, axis = plt.subplots(figsize=(7.5, 2.6))
+largest = np.abs(v_truth.colors).max()
+axis.plot(v_truth.colors.ravel() / largest, "o", color=GREY, markersize=7, label="reference, float64")
+axis.plot(v.colors.ravel() / largest, ".", color=RED, markersize=4, label="a block of threads, float32")
+axis.set(xlabel="Gaussian and channel", ylabel="gradient of its colour, of the largest")
+axis.legend()
+plt.show()
 
 # %% [markdown]
 # ## Play

@@ -19,8 +19,8 @@ REGISTERS = {
     "composite_tiles": 64,
     "composite_tiles_vjp": 80,
     "remove_from_tiles": 64,
-    "similarity_tiles": 96,
-    "similarity_tiles_vjp": 104,
+    "similarity_tiles": 88,
+    "similarity_tiles_vjp": 88,
     "update_numbers": 40,
 }
 
