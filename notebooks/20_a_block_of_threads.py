@@ -125,7 +125,7 @@ show_code(forward_kernel(np.dtype(np.float32), 3, False).function)
 
 # %% [markdown]
 # The picture shows all 256 threads from left to right, and the list from top to bottom: the block takes one line after
-# the other. Yellow is a hit. Everything else is a thread that computes an alpha and adds nothing.
+# the other. Orange is a hit. Everything else is a thread that computes an alpha and adds nothing.
 
 # %%
 steps = is_hit.reshape(len(is_hit), -1)
@@ -194,7 +194,7 @@ figure, axis = plt.subplots(figsize=(7.5, 2.6))
 largest = np.abs(v_truth.colors).max()
 axis.plot(v_truth.colors.ravel() / largest, "o", color=GREY, markersize=7, label="reference, float64")
 axis.plot(v.colors.ravel() / largest, ".", color=RED, markersize=4, label="a block of threads, float32")
-axis.set(xlabel="Gaussian and channel", ylabel="gradient of its colour, of the largest")
+axis.set(xlabel="Gaussian and channel", ylabel="gradient of the colour")
 axis.legend()
 plt.show()
 
