@@ -31,6 +31,7 @@ from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Camera, Floats, Gaussians, Primitives, ProjectionGradient, Scene, TileGrid, View
 
+DESCRIPTION = "Check everything that the backend cuda promises, on a machine with an NVIDIA GPU; print one JSON."
 PARTS = ("oracle", "hard_cases", "recipes", "bytes", "speed")
 GSPLAT_FACTOR = 3.0  # both passes should take at most this many times gsplat's
 
@@ -248,11 +249,20 @@ def size_of(text: str) -> tuple[int, int]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the checks and print one JSON; 0 if everything holds, 1 if not, 2 if there is no GPU."""
-    parser = argparse.ArgumentParser(prog="python -m data_tools.check_gpu", description=__doc__.partition("\n")[0])
-    parser.add_argument("--only", nargs="+", default=PARTS, choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}")
+    parser = argparse.ArgumentParser(prog="python -m data_tools.check_gpu", description=DESCRIPTION)
+    parser.add_argument(
+        "--only", nargs="+", default=PARTS, choices=PARTS, metavar="PART", help=f"parts: {', '.join(PARTS)}"
+    )
     parser.add_argument("--scene", default="all", help="scene of the oracle (default all)")
     parser.add_argument("--cases", help="hard cases whose name holds this (default all)")
-    parser.add_argument("--recipes", nargs="+", default=list(RECIPES), choices=list(RECIPES), metavar="NAME")
+    parser.add_argument(
+        "--recipes",
+        nargs="+",
+        default=list(RECIPES),
+        choices=list(RECIPES),
+        metavar="NAME",
+        help="that train (default all)",
+    )
     parser.add_argument("--iterations", type=int, default=200, help="of every recipe (default 200)")
     parser.add_argument("--against", default="cpu", choices=list(BACKENDS), help="what trains beside it (default cpu)")
     parser.add_argument("--points", type=int, default=5_000, help="of the scene that is trained (default 5000)")

@@ -124,7 +124,7 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
         choices=(*BACKENDS, *CUDA),
         default=default,
         metavar="NAME",
-        help=f"cpu, cpu-exact, reference, cuda, cuda-atomic (default {whose}cpu)",
+        help=f"cpu[-exact], reference, cuda[-atomic] (default {whose}cpu)",
     )
 
 
