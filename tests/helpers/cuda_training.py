@@ -41,13 +41,14 @@ TRAININGS = {
 
 
 def make_scene():
-    """Two photographs of six Gaussians, one of them behind the cameras, and their centres to start from."""
+    """Two photographs of six Gaussians, one of them behind the second camera, and their centres to start from."""
     rng = np.random.default_rng(5)
     truth = as_dtype(make_gaussians(rng, N_GAUSSIANS), np.float32)
-    truth.means[3, 2] = -1
+    truth.means[3] = 0.1, 0.1, 1.5
     views = []
     for i in range(2):
         camera = make_camera(9, 7, fx=9.0, fy=9.0, cx=4.0, cy=3.0)
+        camera = camera._replace(cam_from_world_t=np.array([0.0, 0.0, -2.0 * i]))
         image = render(truth, camera, backend=REFERENCE)[0].image
         mask = None if i else np.arange(63).reshape(7, 9) % 5 > 0
         views.append(View(f"view{i}", camera, np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), mask))
