@@ -83,12 +83,15 @@ ORDER = (
     ),
     Part(
         "the kernels",
-        ("scalar/", "cpu/"),
+        ("scalar/", "cpu/", "cuda/"),
         (
             Step(
                 ("scalar/", "cpu/compositing/plain.py", "cpu/"),
                 (15,),
                 "the same formulas for one Gaussian or one pixel, and fast loops over them",
+            ),
+            Step(
+                ("cuda/target.py", "cuda/compositing/", "cuda/"), (20,), "the loops again, for a block of 256 threads"
             ),
         ),
     ),

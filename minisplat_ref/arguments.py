@@ -11,7 +11,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 Commands = argparse._SubParsersAction
 
 BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
-CUDA = "cuda"  # needs a GPU
+CUDA = ("cuda", "cuda-atomic")  # need a GPU
 SYNTHETIC_SCENES = ("room", "plain-wall", "glossy", "outdoor")  # datasets.synthetic.SCENE_NAMES, which would load NumPy
 
 
@@ -121,10 +121,10 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
     )
     parser.add_argument(
         "--backend",
-        choices=(*BACKENDS, CUDA),
+        choices=(*BACKENDS, *CUDA),
         default=default,
         metavar="NAME",
-        help=f"cpu, cpu-exact, reference or cuda (default {whose}cpu)",
+        help=f"cpu[-exact], reference, cuda[-atomic] (default {whose}cpu)",
     )
 
 

@@ -6,6 +6,7 @@ the only module that sees both the reference and the kernels.
 
 import functools
 from dataclasses import dataclass, replace
+from typing import Any
 
 from minisplat_ref import stages
 from minisplat_ref.cpu import adam as cpu_adam
@@ -43,6 +44,8 @@ class Backend:
         Whether compiled kernels do the work; an extension with its own stage chooses its implementation by this.
     tile_width, tile_height : int
         Size of the tiles that the image is cut into, pixels.
+    residence : module, optional
+        What a training needs besides to keep its arrays on a device; None where they are on the host.
     """
 
     name: str
@@ -62,6 +65,7 @@ class Backend:
     photometric_loss: stages.PhotometricLoss
     photometric_loss_vjp: stages.PhotometricLossVjp
     adam_update: stages.AdamUpdate
+    residence: Any = None
 
 
 REFERENCE = Backend(
@@ -125,23 +129,34 @@ PLAIN = replace(
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
 """The backends that are there on every machine."""
 
-CUDA = "cuda"
-"""The name of the one that :func:`load_cuda` loads."""
+CUDA, CUDA_ATOMIC = "cuda", "cuda-atomic"
+"""The names of those that :func:`load_cuda` and :func:`load_cuda_atomic` load."""
 
 
 @functools.cache
 def load_cuda() -> Backend:
     """Return the backend for an NVIDIA GPU; nothing imports CUDA before.
 
-    Projection, colours, tiling and blending run on the GPU; losses, Adam, surface points and removal are those of the
-    CPU. Arrays are copied to the GPU and back in each stage.
+    Results are where the data are: NumPy arrays are copied to the GPU and back in each stage, arrays of the device stay
+    there.
 
     Raises
     ------
     InputError
         There is no numba-cuda, no GPU, or no driver.
     """
-    from minisplat_ref.cuda import compositing, projection, removal, spherical_harmonics, target, tiling
+    from minisplat_ref.cuda import (
+        adam,
+        compositing,
+        depth,
+        loss,
+        projection,
+        removal,
+        resident,
+        spherical_harmonics,
+        target,
+        tiling,
+    )
 
     target.check_device()
     return replace(
@@ -157,7 +172,21 @@ def load_cuda() -> Backend:
         composite=compositing.composite,
         composite_vjp=compositing.composite_vjp,
         removal_changes=removal.removal_changes,
+        surface_points=depth.surface_points,
+        surface_points_vjp=depth.surface_points_vjp,
+        photometric_loss=loss.photometric_loss,
+        photometric_loss_vjp=loss.photometric_loss_vjp,
+        adam_update=adam.adam_update,
+        residence=resident,
     )
+
+
+@functools.cache
+def load_cuda_atomic() -> Backend:
+    """Return the same with atomic additions in the gradient of blending: faster, but every run rounds differently."""
+    from minisplat_ref.cuda import compositing
+
+    return replace(load_cuda(), name=CUDA_ATOMIC, composite_vjp=compositing.composite_vjp_atomic)
 
 
 def get_backend(name: str) -> Backend:
@@ -166,20 +195,22 @@ def get_backend(name: str) -> Backend:
     Parameters
     ----------
     name : str
-        ``"cpu"``, ``"cpu-exact"``, ``"reference"`` or ``"cuda"``.
+        ``"cpu"``, ``"cpu-exact"``, ``"reference"``, ``"cuda"`` or ``"cuda-atomic"``.
 
     Returns
     -------
     Backend
-        The value of that name in this module, or that of :func:`load_cuda`.
+        The value of that name in this module, or that of :func:`load_cuda` or :func:`load_cuda_atomic`.
 
     Raises
     ------
     InputError
         There is none, or its hardware or package is missing.
     """
-    if name == CUDA:
-        return load_cuda()
+    if name in (CUDA, CUDA_ATOMIC):
+        return load_cuda() if name == CUDA else load_cuda_atomic()
     if name not in BACKENDS:
-        raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(sorted((*BACKENDS, CUDA)))}")
+        raise InputError(
+            f"backend {name!r} is unknown; choose one of {', '.join(sorted((*BACKENDS, CUDA, CUDA_ATOMIC)))}"
+        )
     return BACKENDS[name]

@@ -7,6 +7,7 @@ their own folder.
 import ast
 import inspect
 import io
+import textwrap
 from collections.abc import Callable
 from typing import Any
 
@@ -54,7 +55,7 @@ if (_shell := get_ipython()) is not None:
 
 def show_code(function: Callable) -> None:
     """Print the source of a function without its docstring."""
-    source = inspect.getsource(function)
+    source = textwrap.dedent(inspect.getsource(function))
     lines, body = source.splitlines(), ast.parse(source).body[0].body  # type: ignore[attr-defined]
     has_docstring = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
     print(*lines[: body[0].lineno - 1], *lines[body[has_docstring].lineno - 1 :], sep="\n")

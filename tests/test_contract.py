@@ -16,7 +16,9 @@ from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
 
 MODULES = [module.name for module in iter_modules(reference.__path__)]
 STAGES = [
-    field.name for field in fields(Backend) if field.name not in ("name", "is_compiled", "tile_width", "tile_height")
+    field.name
+    for field in fields(Backend)
+    if field.name not in ("name", "is_compiled", "tile_width", "tile_height", "residence")
 ]
 
 # Modules of cpu without a twin of their name: what several stages use. A stage of several files is a folder, and its
@@ -27,12 +29,17 @@ KERNEL_PARTS = {"gaussian_rows", "memory"}
 CPU_ONLY = {
     "projection.pose_of": "the point that the camera maps to 0, in float64; the reference adds t instead",
     "projection.constants_of": "conventions as float64 scalars",
+    "depth.intrinsics_of": "the camera's four numbers as an array",
     "compositing.composite_with": "the exponential is an argument, which compositing.exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
 }
 
 # Backward formulas whose forward has another name, since one scalar function returns several things.
-FORWARD_OF = {"compositing.sigma_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
+FORWARD_OF = {
+    "compositing.sigma_vjp": "blend",
+    "projection.compensation_vjp": "project_gaussian",
+    "loss.photometric_vjp": "ssim_and_derivatives",
+}
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 ARGUMENTS_MAX = 8  # positional; what belongs together is a NamedTuple

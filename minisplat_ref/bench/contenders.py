@@ -11,7 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import BACKENDS, CPU, CPU_EXACT, PLAIN, REFERENCE, Backend
+from minisplat_ref.backends import (
+    BACKENDS,
+    CPU,
+    CPU_EXACT,
+    CUDA,
+    CUDA_ATOMIC,
+    PLAIN,
+    REFERENCE,
+    Backend,
+    get_backend,
+)
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.passes import RASTERIZATION, RENDER, Passes
 from minisplat_ref.bench.textbook import TEXTBOOK
@@ -96,10 +106,30 @@ def choose(names: tuple[str, ...] | None) -> list[Contender]:
     contenders = all_contenders()
     if names is None:
         return list(contenders.values())
+    names = tuple(name for given in names for name in (ON_GPU if given == CUDA else (given,)))
+    contenders = contenders | {name: _on_gpu(name) for name in names if name in ON_GPU}
     for name in names:
         if name not in contenders:
-            raise InputError(f"contender {name!r} is unknown; choose from {', '.join(contenders)}")
+            raise InputError(f"contender {name!r} is unknown; choose from {', '.join((*contenders, CUDA))}")
     return [contenders[name] for name in contenders if name in (*names, REFERENCE_NAME)]
+
+
+ON_GPU = {"cuda-f32": CUDA, "cuda-atomic-f32": CUDA_ATOMIC}
+"""Contenders that need a GPU, only where they are named; ``cuda`` stands for both. Their times include copying."""
+
+
+def _on_gpu(name: str) -> Contender:
+    """Return a contender for a GPU.
+
+    Raises
+    ------
+    InputError
+        There is none, or the simulator takes its place, whose times say nothing.
+    """
+    backend = get_backend(ON_GPU[name])
+    if backend.residence.is_simulated:
+        raise InputError(f"{name} would be timed in Numba's simulator, which says nothing: unset NUMBA_ENABLE_CUDASIM")
+    return Contender(name, backend, np.float32)
 
 
 def _of_degree(degree: int) -> Contender:

@@ -78,7 +78,8 @@ def _surface_points(
                     points[y, x, i] = centre[i] + t * d[i]
 
 
-def _intrinsics(camera: Camera) -> Floats:
+def intrinsics_of(camera: Camera) -> Floats:
+    """Return fx, fy, cx and cy as an array [4]."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
 
 
@@ -86,7 +87,7 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
     """Densest point of each pixel's dominant Gaussian; see ``reference.depth.surface_points``."""
     out = SurfacePoints(np.zeros((*dominant_ids.shape, 3), means.dtype), np.zeros(dominant_ids.shape, means.dtype))
     ellipsoids = Ellipsoids(means, quats, scales)
-    _surface_points(ellipsoids, pose_of(camera), _intrinsics(camera), dominant_ids, out.points, out.depths)
+    _surface_points(ellipsoids, pose_of(camera), intrinsics_of(camera), dominant_ids, out.points, out.depths)
     return out
 
 
@@ -156,7 +157,7 @@ def surface_points_vjp(
     _surface_points_vjp(
         Ellipsoids(means, quats, scales),
         pose_of(camera),
-        _intrinsics(camera),
+        intrinsics_of(camera),
         PixelLists(pixels, offsets),
         depths,
         SurfacePoints(v_points, v_depths),

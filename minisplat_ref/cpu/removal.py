@@ -30,10 +30,10 @@ from minisplat_ref.cpu.compositing.tile_state import (
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, load, minimum, reduce_sum, select, store
-from minisplat_ref.jit.literals import ONE, ZERO
+from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, load, reduce_sum, store
 from minisplat_ref.jit.scheduling import make_shared_counter
 from minisplat_ref.scalar.compositing import blend
+from minisplat_ref.scalar.removal import odds, removal_change
 from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
 
 
@@ -100,13 +100,12 @@ def removal_kernel(exp: Callable, n_channels: int) -> Callable:
                 unclamped = load(scratch, ALPHAS + row * WIDTH)
                 after, weight = blend(load(s, i), unclamped, frame)
                 store(s, i, after)
-                alpha = minimum(unclamped, frame.alpha_max)
-                odds = select(weight > ZERO, alpha / (ONE - alpha), ZERO)
+                hit_odds = odds(weight, unclamped, frame)
                 for k in range(n_channels):
                     light = weight * records[n, COLOR + k]
                     behind = load(s, i + behind_place + k * WIDTH) - light
                     store(s, i + behind_place + k * WIDTH, behind)
-                    q = light - odds * behind
+                    q = removal_change(light, hit_odds, behind)
                     total = total + q * q
             slots[slots_of[m]] = reduce_sum(total)
 

@@ -1,11 +1,16 @@
-"""Arrays and bundles of arrays on their way to the device and back."""
+"""Arrays and bundles of arrays on their way to the device and back.
+
+The results of a stage are where its data were: on the device for arrays of the device, on the host for NumPy arrays.
+Everything that is copied passes through :func:`to_device` and :func:`to_host`.
+"""
 
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.cuda.target import cuda
+from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
+from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.types import Floats
 
 
@@ -30,11 +35,32 @@ def to_host(value: Any) -> Any:
     return value.copy_to_host() if hasattr(value, "copy_to_host") else value
 
 
+def is_on_device(value: Any) -> bool:
+    """Return whether an array is on the device."""
+    return hasattr(value, "copy_to_host")
+
+
+def beside(like: Any, value: Any) -> Any:
+    """Return results on the device, an array or a bundle, where the data ``like`` are: there, or on the host."""
+    return value if is_on_device(like) else to_host(value)
+
+
 def empty(shape: Any, dtype: Any) -> Any:
     """Return an uninitialised array on the device."""
     return cuda.device_array(shape, dtype)
 
 
-def zeros(shape: Any, dtype: Any) -> Floats:
-    """Return zeros on the device."""
-    return cuda.to_device(np.zeros(shape, dtype))
+@gpu_kernel
+def clear_rows(table):
+    """Set a row of ``table`` [N, W] to zero."""
+    n = cuda.grid(1)
+    if n < table.shape[0]:
+        for k in range(table.shape[1]):
+            table[n, k] = ZERO
+
+
+def zeros(shape: tuple[int, int], dtype: Any) -> Floats:
+    """Return a table of zeros on the device."""
+    table = empty(shape, dtype)
+    launch_rows(clear_rows, shape[0], table)
+    return table

@@ -9,7 +9,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.projection import constants_of, pose_of
-from minisplat_ref.cuda.arrays import empty, to_device, to_host
+from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host
 from minisplat_ref.cuda.target import ROW_THREADS, cuda, device_function, gpu_kernel, launch_rows, n_row_blocks
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import Extent, inria_box, is_seen, support_box
@@ -110,7 +110,7 @@ def project(
     extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
     primitives, pose = to_device(Primitives(means, quats, scales, opacities)), to_device(pose_of(camera))
     launch_rows(project_rows, n, primitives, pose, constants_of(camera, conventions), extent, out)
-    return to_host(out)
+    return beside(means, out)
 
 
 @device_function
@@ -209,5 +209,5 @@ def project_vjp(
         v_poses,
     )
     v_pose = np.sum(to_host(v_poses), axis=0).reshape(3, 4).astype(dtype)
-    v = to_host(out)
+    v = beside(means, out)
     return PrimitiveGradient(v.means, v.quats, v.scales, v.opacities, v_pose[:, :3].copy(), v_pose[:, 3].copy())

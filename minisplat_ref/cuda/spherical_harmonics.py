@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cuda.arrays import empty, to_device, to_host
+from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host
 from minisplat_ref.cuda.projection import sum_parts, wide_triple
 from minisplat_ref.cuda.target import (
     ROW_THREADS,
@@ -55,7 +55,7 @@ class Harmonics(NamedTuple):
     constants: Floats
     """[10] of degrees 0, 1, 2 (3) and 3 (5)."""
     degrees: Ints
-    """[N] uint8, active degree of each Gaussian."""
+    """[N] uint8, active degree of each Gaussian, or [1] of all."""
 
 
 _CONSTANTS = (SH_C0, SH_C1, *SH_C2, *SH_C3)
@@ -107,7 +107,7 @@ def colors_kernel(dtype: np.dtype) -> GpuKernel:
                 colors[n, k] = ZERO
             return
         y = cuda.local.array(N_REST, dtype)
-        degree = int(degrees[n])
+        degree = int(degrees[min(n, degrees.shape[0] - 1)])
         mean = wide_triple(means, n)
         dx, dy, dz, _ = direction(centre, mean[0], mean[1], mean[2])
         store_basis((real(dx), real(dy), real(dz)), degree, c, y)
@@ -135,7 +135,7 @@ def colors_vjp_kernel(dtype: np.dtype) -> GpuKernel:
         v_means, v_dc, v_rest = out
         if n < means.shape[0]:
             n_stored = sh_rest.shape[1]
-            degree = int(degrees[n])
+            degree = int(degrees[min(n, degrees.shape[0] - 1)])
             n_rest = (degree + 1) * (degree + 1) - 1
             if radii[n, 0] == 0:
                 n_rest = 0
@@ -179,7 +179,7 @@ def colors_vjp_kernel(dtype: np.dtype) -> GpuKernel:
 
 
 def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
-    degrees = np.full(len(means), degree, np.uint8)
+    degrees = np.atleast_1d(np.asarray(degree, np.uint8))
     return Harmonics(camera.astype(np.float64).center, np.array(_CONSTANTS, means.dtype), degrees)
 
 
@@ -188,7 +188,7 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
     colors = empty(sh_dc.shape, sh_dc.dtype)
     shaded, harmonics = to_device(Shaded(means, sh_dc, sh_rest)), to_device(_harmonics(camera, degree, means))
     launch_rows(colors_kernel(means.dtype), len(means), shaded, harmonics, to_device(radii), colors)
-    return to_host(colors)
+    return beside(means, colors)
 
 
 def sh_colors_vjp(
@@ -208,5 +208,5 @@ def sh_colors_vjp(
     # Sum over the Gaussians of the gradient with respect to their offset, mean - centre, with centre = -R^T t.
     v_offset = np.sum(to_host(v_offsets), axis=0)
     v_R, v_t = np.outer(camera.cam_from_world_t, v_offset), camera.cam_from_world_R @ v_offset
-    v = to_host(out)
+    v = beside(means, out)
     return SHGradient(v.means, v.sh_dc, v.sh_rest, v_R.astype(dtype), v_t.astype(dtype))

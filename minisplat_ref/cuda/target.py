@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, one_line
 from minisplat_ref.jit import lanes
 
 try:
@@ -28,8 +28,11 @@ __all__ = [
     "WARP",
     "GpuKernel",
     "check_device",
+    "check_room",
     "cuda",
+    "describe_device",
     "device_function",
+    "free_bytes",
     "gpu_kernel",
     "is_simulated",
     "launch",
@@ -38,6 +41,7 @@ __all__ = [
     "reduce_warps",
 ]
 
+MIN_CAPABILITY = (7, 5)  # the oldest that the compiler of CUDA 13 knows
 WARP = 32  # threads that run together
 FULL_WARP = 0xFFFFFFFF
 ROW_THREADS = 128  # of a block, where each thread has one Gaussian or pair
@@ -50,7 +54,7 @@ def check_device() -> None:
     Raises
     ------
     InputError
-        There is no NVIDIA GPU, or no driver for it.
+        There is no NVIDIA GPU, no driver for it, or one of them is too old.
     """
     if is_simulated:
         return
@@ -60,6 +64,64 @@ def check_device() -> None:
         found = False
     if not found:
         raise InputError("backend cuda found no NVIDIA GPU with a working driver; nvidia-smi should list one. Use cpu")
+    device = cuda.get_current_device()
+    if device.compute_capability < MIN_CAPABILITY:
+        found, least = (".".join(map(str, pair)) for pair in (device.compute_capability, MIN_CAPABILITY))
+        raise InputError(
+            f"the GPU {_text(device.name)} has compute capability {found}, and kernels are compiled for {least} or"
+            " later: use a newer GPU, or --backend cpu"
+        )
+    try:
+        launch(GpuKernel(_do_nothing), 1, 1, np.float32(0))
+        cuda.synchronize()
+    except Exception as error:  # a driver that does not know the compiler's PTX fails here, in one of several ways
+        why = one_line(str(error))[:200]
+        raise InputError(
+            f"the GPU {_text(device.name)} cannot run a kernel ({why}): update its driver, install"
+            " numba-cuda[cu12] for an older one, or use --backend cpu"
+        ) from error
+
+
+def _do_nothing(number):
+    """Do nothing, to see whether kernels run."""
+
+
+def _text(name: str | bytes) -> str:
+    return name.decode() if isinstance(name, bytes) else name
+
+
+def describe_device() -> dict[str, Any]:
+    """Return the card's name, compute capability and bytes of memory, and the driver's version."""
+    if is_simulated:
+        return {"name": "Numba's simulator, no GPU"}
+    device, memory = cuda.get_current_device(), cuda.current_context().get_memory_info()
+    return {
+        "name": _text(device.name),
+        "compute_capability": list(device.compute_capability),
+        "driver": list(cuda.cudadrv.driver.driver.get_version()),
+        "memory": int(memory.total),
+    }
+
+
+def free_bytes() -> float:
+    """Return how much memory of the device is free; the simulator does not say, and so returns infinity."""
+    return float(cuda.current_context().get_memory_info().free)
+
+
+def check_room(n_bytes: float, what: str) -> None:
+    """Refuse what does not fit into the memory of the device, before it is allocated.
+
+    Raises
+    ------
+    InputError
+        It does not.
+    """
+    free = free_bytes()
+    if n_bytes > free:
+        raise InputError(
+            f"the GPU has no memory for {what}: {n_bytes / 1e9:.2f} GB are needed, {free / 1e9:.2f} GB are free; use"
+            " smaller images (--downscale), fewer Gaussians (--budget), or --backend cpu"
+        )
 
 
 class GpuKernel:

@@ -28,7 +28,7 @@ def collect_gradients(state: TrainState, iteration: Iteration) -> None:
     Gaussian is still rendered; gradients are multiplied by it, so that their mean, like the threshold, refers to all
     views.
     """
-    n = n_rows(state.gaussians)
+    n = n_rows(state.layout)
     if "gradient_sum" not in state.stats:
         state.stats["gradient_sum"] = np.zeros(n, iteration.v_means2d.dtype)
         state.stats["view_count"] = np.zeros(n, np.int32)

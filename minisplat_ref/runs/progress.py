@@ -102,11 +102,11 @@ class Progress(AbstractContextManager["Progress"]):
         self._losses.append(report.loss)
         if report.step % LOG_EVERY and report.step != report.last_step:
             return
-        image = np.clip(report.output.image, 0.0, 1.0)  # [H, W, 3]
+        image = np.clip(np.asarray(report.output.image), 0.0, 1.0)  # [H, W, 3]
         view_psnr = psnr(image, report.view.image, report.view.mask)
         self._psnrs.append(min(view_psnr, PSNR_MAX))
         loss, mean_psnr = float(np.mean(self._losses)), float(np.mean(self._psnrs))
-        gaussians = report.state.gaussians
+        gaussians = report.state.layout
         n_gaussians = len(gaussians.means)
         seconds, cpu_seconds = self.clock
         append_log(

@@ -1,7 +1,8 @@
-"""Structural similarity of one pixel (Wang et al. 2004) from its windowed moments, and its derivative."""
+"""Structural similarity of one pixel (Wang et al. 2004) from its windowed moments, and the gradient of L1 + D-SSIM."""
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.literals import HALF, ONE, TWO
+from minisplat_ref.jit.lanes import select
+from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 
 
 @scalar
@@ -23,3 +24,17 @@ def ssim_and_derivatives(mean_i, mean_t, mean_squares, mean_it, c1, c2):
     by_it = TWO * a1 * inverse
     by_i = TWO * (light_t * a2 - light_i * value * b2) * inverse - TWO * mean_i * by_ii - mean_t * by_it
     return value, by_i, by_ii, by_it
+
+
+@scalar
+def photometric_vjp(i, t, by_i, by_ii, by_it, up, v_ssim):
+    """Return the gradient with respect to one number I of the image, given the windowed derivatives around it.
+
+    ``up`` is dL/d|I - T|, and v_ssim is dL/dSSIM of every pixel:
+
+        v_I = up sign(I - T) + v_ssim (by_i + 2 I by_ii + T by_it)
+    """
+    by_squares = TWO * i * by_ii + t * by_it
+    by_ssim = by_i + by_squares
+    by_l1 = select(i > t, up, select(i < t, -up, ZERO * up))
+    return by_l1 + v_ssim * by_ssim

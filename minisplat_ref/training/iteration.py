@@ -10,25 +10,27 @@ degree of its harmonics, neither colours nor Adam compute with the degrees above
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref import memory
 from minisplat_ref.io.stored_views import ReadingAhead, make_room
-from minisplat_ref.rendering import RenderGradient, RenderSettings
+from minisplat_ref.rendering import RenderGradient, RenderSettings, Request
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.adam import AdamRule, adam_step, fields_of
 from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
-from minisplat_ref.training.losses import Loss, Rendered, total_loss
+from minisplat_ref.training.losses import Loss, LossTerm, Rendered, total_loss
 from minisplat_ref.training.pace import Cooling, trained_ids
 from minisplat_ref.training.rates import active_sh_degree, n_coefficients
+from minisplat_ref.training.resident import Differentiated as OnDevice
+from minisplat_ref.training.resident import Residence
 from minisplat_ref.training.schedule import DatedEvent, During, Recipe, action_name
 from minisplat_ref.training.state import DEGREES, FiredEvent, Iteration, StepReport, TrainState
-from minisplat_ref.types import NOTHING, Floats, Ints, Scene, View
+from minisplat_ref.types import NOTHING, Floats, Ints, Model, Scene, View
 
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
 
@@ -45,6 +47,8 @@ class Surroundings(NamedTuple):
     render_settings: RenderSettings
     guard: Guard
     ahead: ReadingAhead
+    residence: Residence | None = None
+    """Where the arrays are while the backend keeps them on a device."""
 
 
 def iterate(state: TrainState, around: Surroundings, interruptions: Interruptions) -> StepReport:
@@ -73,6 +77,8 @@ class _Differentiated(NamedTuple):
     """[V] rows that the view sees, ascending."""
     wrong: Wrong | None
     """Why the step is to be skipped, if it is."""
+    on_device: OnDevice | None = None
+    """The same on a device; then the fields above have no gradient and no rows."""
 
 
 def _differentiate(state: TrainState, around: Surroundings) -> _Differentiated:
@@ -89,6 +95,8 @@ def _differentiate(state: TrainState, around: Surroundings) -> _Differentiated:
         sh_degree=state.stats.get(DEGREES, active_sh_degree(step, recipe.sh_milestones)),
         is_visible=state.stats["is_visible"][:, view_id] if "is_visible" in state.stats else None,
     )
+    if around.residence is not None and around.residence.stays_here(state, request, recipe, terms):
+        return _differentiate_on_device(state, around, around.residence, (view, request, terms[0]))
     case = Case(step, state.model, view, scene, request, recipe)
     output, tape = renderer.render(case.model, view, request)
     rendered = Rendered(output, renderer.channels(request.wants), view, scene, case.model, step, request)
@@ -99,11 +107,26 @@ def _differentiate(state: TrainState, around: Surroundings) -> _Differentiated:
     return _Differentiated(case, rendered, loss, gradient, output.visible_ids, wrong)
 
 
+def _differentiate_on_device(
+    state: TrainState, around: Surroundings, residence: Residence, wanted: tuple[View, Request, LossTerm]
+) -> _Differentiated:
+    """Do the same with arrays that stay on the device."""
+    view, request, term = wanted
+    found = residence.differentiate(state, view, request, term)
+    case = Case(state.step + 1, Model(residence.gaussians), view, around.scene, request, around.recipe)
+    wrong = residence.wrong_in(found, state, case, around.guard)
+    rendered = Rendered(found.output, {"rgb": slice(0, 3)}, view, around.scene, case.model, case.step, request)
+    loss = Loss(found.loss, found.v_image, None, NOTHING, NOTHING)
+    nothing: Any = np.empty(0)
+    gradient = RenderGradient(found.gradient, nothing, nothing, nothing, nothing)
+    return _Differentiated(case, rendered, loss, gradient, np.empty(0, np.int64), wrong, found)
+
+
 def _change(state: TrainState, around: Surroundings, differentiated: _Differentiated) -> StepReport:
     """Take the step, and run the events that are due."""
-    case, rendered, loss, _, _, wrong = differentiated
-    recipe, scene, guard = around.recipe, around.scene, around.guard
-    notes: list[str] = []
+    case, rendered, loss, *_ = differentiated
+    recipe, scene, guard, wrong = around.recipe, around.scene, around.guard, differentiated.wrong
+    notes = [] if around.residence is None else around.residence.take_notes()
     due = _due(recipe, case.step)
     if wrong is None:
         _step(state, _rates(state, recipe, case.step, scene.extent), around, differentiated)
@@ -112,10 +135,10 @@ def _change(state: TrainState, around: Surroundings, differentiated: _Differenti
         due = [event for event in due if not isinstance(event, During)]  # which would collect it
     may_edit = any(isinstance(event, DatedEvent) for event in due)
     if may_edit or guard.is_due(case.step):
-        guard.check_parameters(case, "Adam")
+        _check_parameters(case, state, around, differentiated)
     if may_edit:
         state.max_rows = _rows_that_fit(state, scene, rendered.output.n_pairs)
-    iteration = _iteration_done(around, differentiated)._replace(say=notes.append)
+    iteration = _iteration_done(around, differentiated, due)._replace(say=notes.append)
     fired: list[FiredEvent] = []
     for event in due:
         record = _act(event, state, iteration)
@@ -128,20 +151,33 @@ def _change(state: TrainState, around: Surroundings, differentiated: _Differenti
 
 def _rows_that_fit(state: TrainState, scene: Scene, n_pairs: int) -> float:
     """Return how many rows memory has room for, after photographs that can be read again have left it if need be."""
-    n, n_bytes = len(state.gaussians.means), sum(field.nbytes for field in state.gaussians)
+    n, n_bytes = n_rows(state.layout), sum(field.nbytes for field in state.layout)
     to_be_kept = make_room(scene.train_views, memory.bytes_to_double(n, n_bytes, n_pairs))
     return memory.rows_that_fit(n, n_bytes, n_pairs, memory.free_bytes() - to_be_kept)
 
 
-def _iteration_done(around: Surroundings, differentiated: _Differentiated) -> Iteration:
-    """Return what the actions are told about the iteration."""
-    case, rendered, _, gradient, visible_ids, _ = differentiated
+def _check_parameters(case: Case, state: TrainState, around: Surroundings, differentiated: _Differentiated) -> None:
+    """Check the parameters after the step; those on a device are copied back only if one of them is wrong."""
+    if differentiated.on_device is None:
+        around.guard.check_parameters(case, "Adam")
+    elif around.residence is not None and around.residence.has_wrong():
+        around.guard.check_parameters(case._replace(model=state.model), "Adam")
+
+
+def _iteration_done(around: Surroundings, differentiated: _Differentiated, due: Sequence[object]) -> Iteration:
+    """Return what the actions are told about the iteration; from a device, only if one of them is due."""
+    case, rendered, gradient = differentiated.case, differentiated.rendered, differentiated.gradient
+    visible_ids, v_means2d, output = differentiated.visible_ids, gradient.means2d, rendered.output
+    if differentiated.on_device is None or around.residence is None:
+        output = output._replace(image=rendered.channel("rgb"))
+    elif due:
+        visible_ids, v_means2d = around.residence.what_events_need(differentiated.on_device)
     return Iteration(
         around.scene,
         case.view,
-        rendered.output._replace(image=rendered.channel("rgb")),
+        output,
         visible_ids,
-        gradient.means2d,
+        v_means2d,
         around.render_settings,
         around.recipe.representation,
         case.step,
@@ -152,14 +188,17 @@ def _iteration_done(around: Surroundings, differentiated: _Differentiated) -> It
 
 
 def _act(event: During | DatedEvent, state: TrainState, iteration: Iteration) -> FiredEvent:
-    n_before, start = n_rows(state.gaussians), time.perf_counter()
+    n_before, start = n_rows(state.layout), time.perf_counter()
     note = event.action(state, iteration)
-    return FiredEvent(action_name(event), n_before, n_rows(state.gaussians), time.perf_counter() - start, note)
+    return FiredEvent(action_name(event), n_before, n_rows(state.layout), time.perf_counter() - start, note)
 
 
 def _step(state: TrainState, rates: Mapping[str, float], around: Surroundings, differentiated: _Differentiated) -> None:
     """Move all parameters by one step of Adam."""
-    _, _, loss, gradient, visible_ids, _ = differentiated
+    loss, gradient, visible_ids = differentiated.loss, differentiated.gradient, differentiated.visible_ids
+    if differentiated.on_device is not None and around.residence is not None:
+        around.residence.step(state, rates, around.recipe.adam, differentiated.on_device)
+        return
     backend = around.render_settings.backend
     v_gaussians = _with_direct(gradient.gaussians, loss.v_gaussians)
     widths = {"sh_rest": 3 * n_coefficients(state.stats[DEGREES])} if DEGREES in state.stats else NOTHING

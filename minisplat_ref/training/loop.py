@@ -19,6 +19,7 @@ from minisplat_ref.training.initial_state import check_fits, initial_state
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.iteration import Surroundings, iterate
 from minisplat_ref.training.pace import COOLED, Decision
+from minisplat_ref.training.resident import Residence, residing
 from minisplat_ref.training.schedule import Recipe, as_decided
 from minisplat_ref.training.smaller_views import ViewSizes
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
@@ -75,14 +76,15 @@ def train(
     _warn_of_frame(scene)
     check_fits(state, scene, as_decided(recipe, state.pace))
     sizes, switched_on = ViewSizes(recipe, scene), None
-    with ReadingAhead() as ahead, Interruptions() as interruptions:
+    residence = None if backend.residence is None else Residence(backend)
+    with ReadingAhead() as ahead, Interruptions() as interruptions, residing(residence, state):
         while state.step < last_step(state, recipe):
             _cool_in_time(state, recipe)
             if state.pace.switched_on != switched_on:
                 switched_on, decided = state.pace.switched_on, as_decided(recipe, state.pace)
                 settings = RenderSettings(scene.background, conventions, backend, decided.renderer)
             n_halvings = sizes.count_halvings(state.step + 1, state.pace)
-            around = Surroundings(decided, sizes.halve(n_halvings), n_halvings, settings, guard, ahead)
+            around = Surroundings(decided, sizes.halve(n_halvings), n_halvings, settings, guard, ahead, residence)
             report = _complete(iterate(state, around, interruptions), recipe, sizes)
             if on_step is not None:
                 on_step(report)
@@ -109,7 +111,7 @@ def _complete(report: StepReport, recipe: Recipe, sizes: ViewSizes) -> StepRepor
     return report._replace(
         last_step=None if is_open else last_step(state, recipe),
         n_halvings=sizes.count_halvings(state.step + 1, state.pace),
-        fired=(*sizes.record_start(state.step, n_rows(state.gaussians)), *report.fired),
+        fired=(*sizes.record_start(state.step, n_rows(state.layout)), *report.fired),
     )
 
 

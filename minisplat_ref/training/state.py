@@ -54,6 +54,21 @@ class TrainState:
     frame: Frame = FILE_FRAME
     """That of the scene, in which the parameters are."""
 
+    resident: Any = None
+    """A :class:`~minisplat_ref.training.resident.Residence` while it has the newest parameters and moments."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Return ``gaussians`` or ``adam`` from the device, where they are while neither is an attribute here."""
+        if name in ("gaussians", "adam") and self.__dict__.get("resident") is not None:
+            self.resident.bring_back(self)
+            return self.__dict__[name]
+        raise AttributeError(f"{type(self).__name__} has no attribute {name}")
+
+    @property
+    def layout(self) -> Any:
+        """Return the population wherever its arrays are, for their shapes: nothing is copied from a device."""
+        return self.__dict__["gaussians"] if "gaussians" in self.__dict__ else self.resident.gaussians
+
     @property
     def model(self) -> Model:
         """Return the parameters, as the renderer takes them."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuda_stages import CASES, run_stages
+from cuda_stages import CASES, LOSSES, run_stages
 from minisplat_ref.backends import REFERENCE
 from tolerances import (
     CUDA_FLOAT32_GRADIENT,
@@ -41,12 +41,16 @@ def assert_close(found, expected, tolerance, name):
         if isinstance(y, tuple):
             assert_close(x, y, tolerance, f"{name}.{field}")
             continue
-        assert x.shape == y.shape, f"{name}.{field}"
-        if y.dtype.kind == "i":
-            assert np.array_equal(x, y) and x.dtype == y.dtype, f"{name}.{field}"
-        elif y.size:
-            error = np.max(np.abs(x - y)) / max(np.max(np.abs(y)), 1e-300)
-            assert error <= tolerance, f"{name}.{field}: {error}"
+        assert_arrays_close(x, y, tolerance, f"{name}.{field}")
+
+
+def assert_arrays_close(found, expected, tolerance, name):
+    assert found.shape == expected.shape, name
+    if expected.dtype.kind == "i":
+        assert np.array_equal(found, expected) and found.dtype == expected.dtype, name
+    elif expected.size:
+        error = np.max(np.abs(found - expected)) / max(np.max(np.abs(expected)), 1e-300)
+        assert error <= tolerance, f"{name}: {error}"
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -65,7 +69,30 @@ def test_every_stage_is_that_of_the_reference(simulated, name):
     assert_close(found["output"], expected["output"], image, "output")
     assert_close(found["plain_output"], expected["plain_output"], image, "plain_output")
     assert_close(found["output_vjp"], expected["output_vjp"], gradient, "output_vjp")
+    if "atomic_vjp" in found:
+        assert_close(found["atomic_vjp"], expected["atomic_vjp"], gradient, "atomic_vjp")
     assert {x.dtype for x in found["output_vjp"]} <= {np.dtype(case.dtype), np.dtype(np.float64)}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_removal_points_loss_and_adam_are_those_of_the_reference(simulated, name):
+    case, found = CASES[name], simulated[0][name]
+    expected = run_stages(case, REFERENCE, np.float64, found)
+    is_wide = case.dtype == np.float64
+    one, gradient = (PARITY_FLOAT64,) * 2 if is_wide else (PARITY_FLOAT32_PROJECTION, CUDA_FLOAT32_GRADIENT)
+    if "removal" in expected:
+        assert_arrays_close(found["removal"], expected["removal"], gradient, "removal")
+        assert found["removal"].dtype == np.float64
+    assert_close(found["points"], expected["points"], one, "points")
+    for place, (x, y) in enumerate(zip(found["points_vjp"], expected["points_vjp"], strict=True)):
+        assert_arrays_close(x, y, gradient, f"points_vjp {place}")
+    for kind in LOSSES.get(name, ()):
+        v = found[f"loss_vjp {kind}"]
+        assert v.dtype == case.dtype
+        assert found[f"loss {kind}"] == pytest.approx(expected[f"loss {kind}"], rel=gradient)
+        assert_arrays_close(v, expected[f"loss_vjp {kind}"], gradient, kind)
+        assert np.any(v == 0) == (kind != "bytes") and np.any(v) == (kind != "uncounted")
+    assert_arrays_close(found["adam"], expected["adam"], one, "adam")
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -3,16 +3,21 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU, get_backend
+from minisplat_ref.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.tile_state import lists_of
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import TileGrid
-from scenes import activated, make_camera, make_gaussians
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.resident import Residence
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import TileGrid, View
+from scenes import activated, as_dtype, make_camera, make_gaussians
 
 
 def run_python(code, **variables):
@@ -54,15 +59,66 @@ def test_without_a_gpu_it_says_so():
 
 
 def test_the_names_of_all_backends_are_in_the_message():
-    with pytest.raises(InputError, match="cpu, cpu-exact, cuda, reference"):
+    with pytest.raises(InputError, match="cpu, cpu-exact, cuda, cuda-atomic, reference"):
         get_backend("gpu")
 
 
 def test_kernels_of_the_cpu_refuse_other_tiles():
     camera, g = make_camera(40, 30), make_gaussians(np.random.default_rng(0), 3)
-    projection = CPU.project(*activated(g), camera, GSPLAT_MAIN)
-    bins = CPU.bin_gaussians(projection, TileGrid(40, 30, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
+    projection = REFERENCE.project(*activated(g), camera, GSPLAT_MAIN)  # nothing has to be compiled for it
+    bins = REFERENCE.bin_gaussians(projection, TileGrid(40, 30, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
     lists_of(bins)
     bins = bins._replace(grid=TileGrid(40, 30, 16, 16))
     with pytest.raises(InputError, match="32 x 16 pixels, not of 16 x 16"):
         lists_of(bins)
+
+
+FAKE = """
+import numpy as np
+from types import SimpleNamespace
+from minisplat_ref.cuda import target
+device = SimpleNamespace(name=b"Old Card", compute_capability=CAPABILITY)
+memory = SimpleNamespace(free=1e6, total=2e6)
+target.cuda = SimpleNamespace(
+    is_available=lambda: True, gpus=[device], get_current_device=lambda: device, jit=JIT,
+    current_context=lambda: SimpleNamespace(get_memory_info=lambda: memory),
+)
+"""
+REFUSE = "lambda function: (_ for _ in ()).throw(RuntimeError('[222] unsupported toolchain'))"
+
+
+def say(code, capability=(8, 0), jit="None"):
+    """The last line of what a process with a pretended card says."""
+    pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
+    pretended = FAKE.replace("CAPABILITY", str(capability)).replace("JIT", jit)
+    return run_python(pretended + code, NUMBA_ENABLE_CUDASIM="0").stderr.strip().splitlines()[-1]
+
+
+def test_a_card_that_is_too_old_is_named():
+    assert say("target.check_device()", capability=(6, 1)) == (
+        "minisplat_ref.errors.InputError: the GPU Old Card has compute capability 6.1, and kernels are compiled for 7.5"
+        " or later: use a newer GPU, or --backend cpu"
+    )
+
+
+def test_a_driver_that_is_too_old_is_told_in_one_line():
+    said = say("target.check_device()", jit=REFUSE)
+    assert "the GPU Old Card cannot run a kernel ([222] unsupported toolchain): update its driver" in said
+
+
+def test_too_little_memory_is_foreseen():
+    assert say("target.check_room(3e9, '60,000,000 pairs (tile, Gaussian)')").endswith(
+        "the GPU has no memory for 60,000,000 pairs (tile, Gaussian): 3.00 GB are needed, 0.00 GB are free; use smaller"
+        " images (--downscale), fewer Gaussians (--budget), or --backend cpu"
+    )
+
+
+def test_a_training_that_does_not_fit_is_refused_before_anything_is_copied():
+    g = as_dtype(make_gaussians(np.random.default_rng(0), 50), np.float32)
+    view = View("view", make_camera(40, 30), np.zeros((30, 40, 3), np.uint8), None)
+    device = SimpleNamespace(free_bytes=lambda: 1_000.0)  # a call of anything else is an error
+    state = TrainState(g, zero_moments(g), 0, [], np.random.default_rng(0), {})
+    residence = Residence(SimpleNamespace(name="cuda", residence=device))
+    with pytest.raises(InputError, match=r"no memory for 50 Gaussians in 40 x 30 pixels: some 0\.00 GB are needed"):
+        residence.differentiate(state, view, Request(), None)
+    assert state.gaussians is g

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.surfels.losses import distortion, median_normal_consistency, normal_consistency
 from minisplat_ref.extensions.surfels.method import as_surfels
 from minisplat_ref.extensions.surfels.study import ARMS, outcome
@@ -111,10 +112,8 @@ def test_a_depth_that_surfels_do_not_have_is_refused_in_one_line(run_folder, cap
     assert not (run_folder / "m.ply").exists()
 
 
-def test_the_losses_act_in_the_study(monkeypatch):
+def test_the_losses_act_in_the_study():
     """Each arm that weighs a loss differently ends elsewhere."""
-    from minisplat_ref.datasets.synthetic import make_scene
-
-    made = make_scene("room", views=6, width=32, height=24, supersampling=1, points=150)
+    made = make_scene("room", n_views=6, width=32, height=24, supersampling=1, n_points=150)
     found = [outcome(made, arm, 40, 0)["psnr"] for arm in ("surfels without", "normal_consistency", "both")]
     assert len(set(found)) == 3 and len(ARMS) == 5

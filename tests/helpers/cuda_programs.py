@@ -20,9 +20,22 @@ from numba.cuda.typing.typeof import Purpose, typeof
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
-from minisplat_ref.cuda import arrays, compositing, projection, spherical_harmonics, tiling
+from minisplat_ref.cuda import (
+    adam,
+    arrays,
+    compositing,
+    depth,
+    loss,
+    projection,
+    removal,
+    resident,
+    sorting,
+    spherical_harmonics,
+    target,
+    tiling,
+)
 from minisplat_ref.cuda.target import GpuKernel, cuda
-from minisplat_ref.types import ProjectionGradient, TileGrid
+from minisplat_ref.types import AdamStep, PrimitiveGradient, ProjectionGradient, SHGradient, TileGrid
 from scenes import activated, as_dtype, make_camera, make_gaussians
 
 
@@ -51,7 +64,11 @@ def record_launches():
     launches = {}
     host = SimpleNamespace(to_device=lambda x: x, device_array=lambda shape, dtype: np.zeros(shape, dtype))
     kernels = property(lambda kernel: Recorder(kernel, launches))
-    with patch.object(arrays, "cuda", host), patch.object(GpuKernel, "compiled", kernels):
+    with (
+        patch.object(target, "free_bytes", lambda: np.inf),
+        patch.object(arrays, "cuda", host),
+        patch.object(GpuKernel, "compiled", kernels),
+    ):
         camera, g = make_camera(), as_dtype(make_gaussians(np.random.default_rng(0), 5), np.float32)
         primitives = activated(g)
         for conventions in (GSPLAT_MAIN, INRIA):
@@ -60,6 +77,8 @@ def record_launches():
         p = p._replace(conics=p.conics.astype(np.float64))
         grid = TileGrid(camera.width, camera.height, tiling.TILE, tiling.TILE)
         tiling.bin_gaussians(p, grid, GSPLAT_MAIN)
+        pairs = np.zeros(100, np.int32)
+        sorting.sort_pairs(pairs, pairs, 4)
         bins = REFERENCE.bin_gaussians(p, grid, GSPLAT_MAIN)
         harmonics = g.means, g.sh_dc, g.sh_rest, camera, 3, p.radii
         colors = spherical_harmonics.sh_colors(*harmonics)
@@ -67,9 +86,22 @@ def record_launches():
         background = np.zeros(3, np.float32)
         for wanted in (False, True):
             output = compositing.composite(p, colors, background, bins, GSPLAT_MAIN, with_stats=wanted)
+        compositing.composite_vjp_atomic(p, colors, background, bins, GSPLAT_MAIN, output, output.image, output.alpha)
         v = compositing.composite_vjp(p, colors, background, bins, GSPLAT_MAIN, output, output.image, output.alpha)
         v_projection = ProjectionGradient(v.means2d, p.depths, v.conics, v.opacities)
         projection.project_vjp(*primitives, camera, GSPLAT_MAIN, p, v_projection)
+        removal.removal_changes(p, colors, bins, GSPLAT_MAIN, output)
+        ids, normals = output.stats.dominant_ids, np.zeros_like(output.image)
+        depth.surface_points_vjp(*primitives[:3], camera, ids, normals, output.alpha)
+        loss.photometric_loss(output.image, np.zeros(output.image.shape, np.uint8), 0.2)
+        activated_there = resident.activate(g, None)
+        v_primitives = PrimitiveGradient(*primitives, np.eye(3), np.zeros(3))
+        resident.chain(
+            g, activated_there, v_primitives, SHGradient(g.means, g.sh_dc, g.sh_rest, np.eye(3), np.zeros(3))
+        )
+        resident.visible_widths(p.radii, None)
+        resident.has_wrong(g)
+        adam.adam_update(g.means, g.means, g.means, g.means, None, AdamStep(0.01, 0.9, 0.999, 1e-15))
     return launches
 
 

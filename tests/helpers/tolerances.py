@@ -201,3 +201,7 @@ SURFEL_PLANE = 1e-10
 
 # Gradients of surfels in float32, beside the 2e-5 of others: grazing hits divide by the angle, inverse depths by z^2.
 SURFEL_FLOAT32_GRADIENT = 5e-4
+
+# Parameters and moments after three iterations: Adam divides by the root of the second moment, which enlarges rounding
+# where a gradient is near zero.
+CUDA_TRAINING = 1e-3

@@ -23,6 +23,8 @@ BACKEND is one of
                   format of oracle export; the README.md in there explains it
   cpu, cpu-exact, reference
                   ours
+  cuda, cuda-atomic
+                  ours on an NVIDIA GPU, in float32
   gsplat-torch    gsplat's functions in plain PyTorch, on the CPU
   gsplat, inria   gsplat's kernels, and the rasteriser of the 3DGS paper, where
                   they are installed and there is a CUDA device

@@ -25,9 +25,9 @@ import numpy as np
 
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
-from minisplat_ref.jit.literals import HALF, TWO, ZERO
-from minisplat_ref.scalar.loss import ssim_and_derivatives
+from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, store
+from minisplat_ref.jit.literals import HALF, ZERO
+from minisplat_ref.scalar.loss import photometric_vjp, ssim_and_derivatives
 from minisplat_ref.types import Floats, Ints
 
 HALF_WINDOW = SSIM_WINDOW // 2
@@ -159,10 +159,8 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         up = broadcast(v_l1)
         for i in range(0, n_values, WIDTH):
             a, b = load(image, first + i), load(target, first + i)
-            by_squares = TWO * a * across(s, length + i) + b * across(s, 2 * length + i)
-            by_ssim = across(s, i) + by_squares
-            by_l1 = select(a > b, up, select(a < b, -up, ZERO * up))
-            store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)
+            by_i, by_ii, by_it = across(s, i), across(s, length + i), across(s, 2 * length + i)
+            store(s, 3 * length + i, photometric_vjp(a, b, by_i, by_ii, by_it, up, v_ssim))
         for i in range(n_values):  # copying a slice would test each number
             v_row[i] = s[3 * length + i]
 

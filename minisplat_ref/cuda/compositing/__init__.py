@@ -6,12 +6,12 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.tile_state import frame_of
-from minisplat_ref.cuda.arrays import empty, to_device, to_host, zeros
+from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host, zeros
 from minisplat_ref.cuda.compositing.backward import backward_kernel
 from minisplat_ref.cuda.compositing.forward import forward_kernel
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS, N_PAIR_STATS, sum_pair_stats, sum_slots
 from minisplat_ref.cuda.compositing.records import records_of
-from minisplat_ref.cuda.compositing.tiles import BLOCK, Lists, Pixels
+from minisplat_ref.cuda.compositing.tiles import BLOCK, Pixels, lists_of
 from minisplat_ref.cuda.target import launch, launch_rows
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
@@ -26,7 +26,10 @@ def composite(
     with_stats: bool = False,
     with_median_depth: bool = False,
 ) -> RenderOutput:
-    """Blend every tile's Gaussians front to back; see ``reference.compositing.composite``."""
+    """Blend every tile's Gaussians front to back; see ``reference.compositing.composite``.
+
+    Statistics are on the host wherever the data are: only density control and pruning read them.
+    """
     grid, (n, n_channels), dtype = bins.grid, colors.shape, colors.dtype
     shape, collects = (grid.height, grid.width), with_stats or with_median_depth
     pixels = Pixels(empty((*shape, n_channels), dtype), empty(shape, dtype))
@@ -40,7 +43,7 @@ def composite(
         records_of(projection, colors),
         to_device(projection.depths),
         to_device(background),
-        _lists_of(bins),
+        lists_of(bins),
         frame_of(bins, conventions, dtype),
         pixels,
         (slots, median_depth, dominant_ids),
@@ -53,8 +56,8 @@ def composite(
         dominant_count = np.bincount(ids[ids >= 0], minlength=n).astype(np.int32)
         weight_sum, weight_max, hit_count = map(to_host, sums)
         stats = BlendStats(weight_sum, weight_max, hit_count, dominant_count, ids)
-    image, alpha = to_host(pixels)
-    return RenderOutput(image, alpha, to_host(median_depth) if with_median_depth else None, stats)
+    image, alpha = beside(colors, pixels)
+    return RenderOutput(image, alpha, beside(colors, median_depth) if with_median_depth else None, stats)
 
 
 def composite_vjp(
@@ -68,19 +71,46 @@ def composite_vjp(
     v_alpha: Floats,
 ) -> CompositeGradient:
     """Chain the gradient of the image to its inputs; see ``reference.compositing.composite_vjp``."""
+    return _vjp((projection, colors, background), bins, conventions, output, Pixels(v_image, v_alpha), False)
+
+
+def composite_vjp_atomic(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> CompositeGradient:
+    """Do the same with atomic additions: faster, but every run rounds differently."""
+    return _vjp((projection, colors, background), bins, conventions, output, Pixels(v_image, v_alpha), True)
+
+
+def _vjp(
+    inputs: tuple[Projection, Floats, Floats],
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v: Pixels,
+    is_atomic: bool,
+) -> CompositeGradient:
+    projection, colors, _ = inputs
     (n, n_channels), dtype = colors.shape, colors.dtype
-    slots = zeros((len(bins.gaussian_ids), N_MOMENTS + n_channels), dtype)  # zero behind a tile's last hit
+    n_slots = n if is_atomic else len(bins.gaussian_ids)
+    slots = zeros((n_slots, N_MOMENTS + n_channels), dtype)  # zero behind a tile's last hit
     n_tiles = len(bins.tile_offsets) - 1
     v_backgrounds = empty((n_tiles, n_channels), dtype)
     launch(
-        backward_kernel(dtype, n_channels),
+        backward_kernel(dtype, n_channels, is_atomic),
         n_tiles,
         BLOCK,
         records_of(projection, colors),
-        _lists_of(bins),
+        lists_of(bins),
         frame_of(bins, conventions, dtype),
         to_device(Pixels(output.image, output.alpha)),
-        to_device(Pixels(v_image.astype(dtype), v_alpha.astype(dtype))),
+        to_device(Pixels(_as_dtype(v.image, dtype), _as_dtype(v.alpha, dtype))),
         slots,
         v_backgrounds,
     )
@@ -91,11 +121,11 @@ def composite_vjp(
         empty((n, n_channels), dtype),
         to_host(v_backgrounds).sum(axis=0, dtype=np.float64).astype(dtype),
     )
-    offsets = to_device(bins.gaussian_offsets)
+    offsets = to_device(np.arange(n + 1) if is_atomic else bins.gaussian_offsets)
     conics, opacities = to_device(projection.conics), to_device(projection.opacities)
     launch_rows(sum_slots, n, slots, offsets, conics, opacities, tuple(out[:4]))
-    return to_host(out)
+    return beside(colors, out)
 
 
-def _lists_of(bins: TileBins) -> Any:
-    return to_device(Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots))
+def _as_dtype(array: Any, dtype: Any) -> Any:
+    return array if array.dtype == dtype else array.astype(dtype)

@@ -2,8 +2,11 @@
 
 The arithmetic is that of the CPU's kernel, see :mod:`minisplat_ref.cpu.compositing.backward`. A thread keeps its
 pixel's transmittance and the part of <v, image> behind the current hit; the gradient of a Gaussian is made of six
-moments of q = dL/dsigma and the sums of its colours. There are no atomic operations: moments are summed over each warp,
-the warps' sums are added in order into the slot of the pair (tile, Gaussian), and slots are summed in order afterwards.
+moments of q = dL/dsigma and the sums of its colours. Moments are summed over each warp, the warps' sums are added in
+order into the slot of the pair (tile, Gaussian), and slots are summed in order afterwards: the same bytes in every run.
+
+The atomic version adds a tile's sums to those of the Gaussian at once, in whatever order the tiles finish. It needs no
+slots, which saves memory and a pass over them, but every run rounds differently.
 """
 
 import functools
@@ -20,8 +23,8 @@ from minisplat_ref.scalar.compositing import blend, sigma_vjp
 
 
 @functools.cache
-def backward_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
-    """Return the backward kernel for a dtype and a number of channels."""
+def backward_kernel(dtype: np.dtype, n_channels: int, is_atomic: bool = False) -> GpuKernel:
+    """Return the backward kernel for a dtype and a number of channels, deterministic or atomic."""
     n_fields, n_colors, n_sums, real = COLOR + n_channels, max(n_channels, 1), N_MOMENTS + n_channels, dtype.type
     n_exchanged = BLOCK if is_simulated else 1
 
@@ -32,7 +35,7 @@ def backward_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
         frame,
         pixels,  # Pixels
         v_pixels,  # Pixels
-        slots,  # [M, 6 + D] zeros
+        slots,  # [M, 6 + D] zeros; if atomic [N, 6 + D], sums of each Gaussian
         v_backgrounds,  # [n_tiles, D]
     ):
         offsets, ids, slots_of = lists
@@ -83,7 +86,10 @@ def backward_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
                 total = partial[j, 0, k]
                 for warp in range(1, N_WARPS):
                     total += partial[j, warp, k]
-                slots[slots_of[start + j], k] = total
+                if is_atomic:
+                    cuda.atomic.add(slots, (ids[start + j], k), total)
+                else:
+                    slots[slots_of[start + j], k] = total
         cuda.syncthreads()
         for k in range(n_channels):
             summed[k] = abs(T) * v[k]

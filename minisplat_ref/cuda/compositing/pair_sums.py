@@ -36,7 +36,7 @@ def sum_slots(
         for slot in range(first, end):
             total += slots[slot, N_MOMENTS + k]
         v_colors[n, k] = total
-    if first == end:
+    if first == end or opacities[n] == ZERO:  # no pair, or culled
         v_means2d[n, 0] = v_means2d[n, 1] = v_opacities[n] = ZERO
         v_conics[n, 0] = v_conics[n, 1] = v_conics[n, 2] = ZERO
         return

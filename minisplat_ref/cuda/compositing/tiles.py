@@ -1,14 +1,15 @@
 """A tile is a block of 256 threads, one for each pixel. Batches of its list are read into shared memory."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from minisplat_ref.cuda.arrays import to_device
 from minisplat_ref.cuda.compositing.records import HALF_A, HALF_PIVOT, MEAN_X, MEAN_Y, OPACITY, SLOPE, X0, X1, Y0, Y1
 from minisplat_ref.cuda.target import WARP, cuda, device_function
 from minisplat_ref.cuda.tiling import TILE
 from minisplat_ref.jit.lanes import exp_of, select
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import mahalanobis
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import Floats, Ints, TileBins
 
 BLOCK = TILE * TILE
 N_WARPS = BLOCK // WARP
@@ -24,6 +25,11 @@ class Lists(NamedTuple):
     """[M] Gaussian of each pair."""
     slots: Ints
     """[M] slot of each pair."""
+
+
+def lists_of(bins: TileBins) -> Any:
+    """Return the lists on the device."""
+    return to_device(Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots))
 
 
 class Pixels(NamedTuple):

@@ -6,13 +6,14 @@ Other people's renderers are in :mod:`minisplat_ref.oracle.peers`; :mod:`minispl
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.backends import BACKENDS, CPU, REFERENCE, Backend
+from minisplat_ref.backends import BACKENDS, CPU, CUDA, CUDA_ATOMIC, REFERENCE, Backend, get_backend
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, PROFILES, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
@@ -117,6 +118,13 @@ def _check_kind(file: Path, name: str, array: NDArray[Any]) -> None:
 NOT_OF_GSPLAT = ("loss", "statistics", "surface", "adam")  # stages that gsplat's functions in torch do not have
 
 
+def _on_gpu(name: str, dtype: str) -> ComparedRenderer:
+    """Return one of our backends for a GPU; where the simulator takes the GPU's place, its name says so."""
+    backend = get_backend(name)
+    where = " in the simulator" if backend.residence.is_simulated else ""
+    return from_backend(replace(backend, name=f"{name}{where}"), dtype)
+
+
 def _gsplat_torch(dtype: str) -> ComparedRenderer:
     from minisplat_ref.oracle.peers.cuda import rules_of
     from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
@@ -150,8 +158,8 @@ def choose_renderer(name: str, dtype: str | None) -> ComparedRenderer:
     Parameters
     ----------
     name : str
-        ``cpu``, ``cpu-exact``, ``reference``, ``planted:ERROR``, ``profile:NAME``, ``gsplat-torch``, ``gsplat``,
-        ``inria``, or a folder of dumps.
+        ``cpu``, ``cpu-exact``, ``reference``, ``cuda``, ``cuda-atomic``, ``planted:ERROR``, ``profile:NAME``,
+        ``gsplat-torch``, ``gsplat``, ``inria``, or a folder of dumps.
     dtype : str, optional
         ``"float32"`` or ``"float64"``; by default float64 for ours, float32 on a GPU, and that of each dumped array.
 
@@ -164,6 +172,8 @@ def choose_renderer(name: str, dtype: str | None) -> ComparedRenderer:
     own_dtype = dtype or "float64"
     if name in BACKENDS:
         return from_backend(BACKENDS[name], own_dtype)
+    if name in (CUDA, CUDA_ATOMIC):
+        return _on_gpu(name, dtype or "float32")
     if kind == "planted" and not Path(name).is_dir():
         return with_planted_error(rest, own_dtype)
     if kind == "profile" and not Path(name).is_dir():
@@ -181,7 +191,7 @@ def choose_renderer(name: str, dtype: str | None) -> ComparedRenderer:
     errors = ", ".join(error.name for error in PLANTED)
     raise InputError(
         f"{name!r} is neither a folder of dumps nor a renderer: package.module:function, {', '.join(BACKENDS)},"
-        " gsplat-torch, gsplat, inria,"
+        " cuda, cuda-atomic, gsplat-torch, gsplat, inria,"
         f" profile:NAME ({', '.join(PROFILES)}) or planted:ERROR ({errors})"
     )
 

@@ -1,0 +1,67 @@
+"""Trainings whose arrays stay on the device, in Numba's simulator, against the same by the reference."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuda_training import N_GAUSSIANS, TRAININGS, train_by
+from minisplat_ref.backends import REFERENCE
+from tolerances import CUDA_TRAINING
+
+pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
+
+HELPERS = Path(__file__).parent.parent / "helpers"
+MOST_COPIES = 40  # of an iteration: cameras, lists that the host sorts, sums over tiles
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cuda") / "results.pickle"
+    places = os.pathsep.join([str(HELPERS), str(HELPERS.parent.parent), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
+    subprocess.run([sys.executable, HELPERS / "cuda_training.py", path], env=environment, check=True)
+    return pickle.loads(path.read_bytes())
+
+
+@pytest.mark.parametrize("name", TRAININGS)
+def test_parameters_and_moments_are_those_of_the_reference(simulated, name):
+    expected, found = train_by(TRAININGS[name], REFERENCE), simulated[name]
+    assert found.keys() == expected.keys()
+    for key, x in expected.items():
+        assert found[key].shape == x.shape and found[key].dtype == x.dtype, key
+        difference = np.abs(found[key].astype(float) - x)
+        error = np.max(difference, initial=0) / max(np.max(np.abs(x), initial=0), 1e-30)
+        assert error <= CUDA_TRAINING, f"{key}: {error}"
+    n = len(expected["p.means"])
+    assert (n > N_GAUSSIANS) == (name == "events")  # rows were added in the middle
+
+
+def test_no_parameter_is_copied_where_nobody_looks(simulated):
+    (first, is_resident), (second, is_still_resident) = simulated["copies"]
+    assert is_resident and is_still_resident
+    parameters = {(N_GAUSSIANS, 3), (N_GAUSSIANS, 4), (N_GAUSSIANS, 3, 3)}
+    moved = [shape for shape in first["to"] if shape in parameters]
+    assert len(moved) == 3 * 5  # once, each of them with two moments; opacities have the shape of counts
+    assert not parameters & {*first["from"], *second["to"], *second["from"]}
+    assert first["to"].count((7, 9, 3)) == second["to"].count((7, 9, 3)) == 1  # a photograph, each seen the first time
+    assert (7, 9, 3) not in {*first["from"], *second["from"]}
+    assert len(second["to"]) + len(second["from"]) < MOST_COPIES
+
+
+def test_who_looks_sees_what_is_true_and_may_change_it(simulated):
+    seen, means = simulated["looked"]
+    assert not np.array_equal(seen[0][1:], seen[1][1:])  # an iteration moved the others
+    assert abs(seen[1][0] - 7).max() < 0.01  # on from where it had been put
+    assert np.all(means[0] == 7)
+
+
+def test_what_has_no_kernels_says_so_once(simulated):
+    assert simulated["notes"] == [
+        "backend cuda: the renderer foreign has no kernels for the GPU; arrays stay on the host, and stages that have"
+        " kernels copy them"
+    ]
