@@ -13,7 +13,7 @@ S_2 = sum w q^2, it is ``b^2 (A S_2 - S_1^2)`` with ``b = far near / (far - near
 
 import numpy as np
 
-from minisplat_ref.mechanisms.surfels.depth_normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 from minisplat_ref.types import Floats
