@@ -12,7 +12,10 @@ Commands = argparse._SubParsersAction
 
 BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
 CUDA = ("cuda", "cuda-atomic")  # need a GPU
-SYNTHETIC_SCENES = ("room", "plain-wall", "glossy", "outdoor")  # datasets.synthetic.SCENE_NAMES, which would load NumPy
+SYNTHETIC_SCENES = (  # datasets.synthetic.SCENE_NAMES, which would load NumPy
+    *("room", "plain-wall", "glossy", "outdoor"),
+    *("staircase", "noisy-sphere", "facing-spheres", "box-city"),
+)
 
 
 class Parser(argparse.ArgumentParser):

@@ -7,13 +7,21 @@ from minisplat_ref.arguments import SYNTHETIC_SCENES, Commands, HelpFormatter
 
 DESCRIPTION = """\
 Ray-trace photographs of a small world, and write them as a COLMAP scene with
-sparse points. Beside it is what no photograph has: the exact depths/ and
-normals/ of every pixel, and scene_info.json. Equal arguments give equal bytes.
+sparse points. Beside it is what no photograph has: the exact depths/, normals/
+and ids/ of every pixel, mesh.ply of the surfaces, and scene_info.json. Equal
+arguments give equal bytes.
 
   room         textured walls, furniture with thin rods
   plain-wall   walls without any texture fill most of the image
   glossy       polished things, whose look changes with the viewpoint
   outdoor      open ground under a sky that has no depth
+
+and four whose surface is the subject:
+
+  staircase       planes at right angles, with steps in depth
+  noisy-sphere    a ball; its points err by a twentieth of the radius
+  facing-spheres  two balls, of which each hides part of the other
+  box-city        blocks with narrow streets
 """
 EPILOG = """\
 example:
@@ -42,7 +50,10 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--supersampling", type=int, default=2, metavar="N", help="N x N samples a pixel (default 2)")
     parser.add_argument("--points", type=int, default=4000, metavar="N", help="sparse points (default 4000)")
     parser.add_argument(
-        "--point-noise", type=float, default=0.0, metavar="M", help="standard error of the points, metres (default 0)"
+        "--point-noise",
+        type=float,
+        metavar="M",
+        help="standard error of the points, metres (default 0, but 0.025 for noisy-sphere)",
     )
     parser.add_argument(
         "--test-every", type=int, default=8, metavar="K", help="every K-th view is for testing, 0: none (default 8)"
@@ -58,6 +69,9 @@ def run(args: argparse.Namespace) -> int:
 
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import check_free, write_scene
+    from minisplat_ref.datasets.synthetic.triangles import triangulate_world
+    from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
+    from minisplat_ref.mechanisms.meshes.files import write_mesh
 
     settings = {
         "n_views": args.views,
@@ -72,7 +86,14 @@ def run(args: argparse.Namespace) -> int:
     check_free(args.out)
     progress = partial(tqdm, desc="ray-tracing", unit=" views", leave=False)
     synthetic = make_scene(args.name, **settings, progress=progress)
-    write_scene(synthetic, args.out, {"scene": args.name, **settings})
+    triangles = triangulate_world(synthetic.world)
+    mesh = ColoredMesh(triangles.vertices, triangles.faces, triangles.colors)
+    write_scene(
+        synthetic,
+        args.out,
+        {"scene": args.name, **settings},
+        lambda folder: write_mesh(folder / "mesh.ply", mesh),
+    )
     scene = synthetic.scene
     counts = f"{len(scene.train_views)} training and {len(scene.test_views)} test views, {len(scene.points)} points"
     print(f"{args.out}: {counts}")

@@ -36,7 +36,7 @@ GREY = Material(Plain("#ffffff"))
 
 @pytest.fixture(scope="module", params=SCENE_NAMES)
 def synthetic(request):
-    return make_scene(request.param, **SMALL)
+    return make_scene(request.param, **SMALL, point_noise=0.0)
 
 
 def place(shape, centre, rotation=None):

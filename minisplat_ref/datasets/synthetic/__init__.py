@@ -1,7 +1,7 @@
-"""Synthetic scenes with exact truth: photographs, depth, normals and sparse points, ray-traced with NumPy.
+"""Synthetic scenes with exact truth: photographs, depth, normals, ids and sparse points, ray-traced with NumPy.
 
-Reading order: shapes, geometry, materials, tracer, cameras, furniture, scenes, sparse_points; files writes a scene as a
-COLMAP folder.
+Reading order: shapes, geometry, materials, tracer, cameras, furniture, lights, truths, scenes, sparse_points; files
+writes a scene as a COLMAP folder, and triangles makes a mesh of a world.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -14,7 +14,7 @@ from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.sparse_points import sample_points
 from minisplat_ref.datasets.synthetic.tracer import TracedView, World, trace_view
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import Bools, Camera, Floats, Scene, View
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
 
 __all__ = ["SCENE_NAMES", "SyntheticScene", "make_scene"]
 
@@ -37,6 +37,10 @@ class SyntheticScene(NamedTuple):
     """[V, H, W, 3] float64 unit normals towards the camera at pixel centres, world frame; 0 at the sky."""
     test_normals: Floats
     """[T, H, W, 3] likewise."""
+    train_ids: Ints
+    """[V, H, W] int16 index of the world's primitive at pixel centres; -1 at the sky."""
+    test_ids: Ints
+    """[T, H, W] likewise."""
     point_visibility: Bools
     """[V, P] which training view sees which of the scene's points."""
     world: World
@@ -52,7 +56,7 @@ def make_scene(
     seed: int = 0,
     supersampling: int = 2,
     n_points: int = 4000,
-    point_noise: float = 0.0,
+    point_noise: float | None = None,
     test_every: int = 8,
     progress: Callable[[Sequence[Camera]], Iterable[Camera]] = iter,
 ) -> SyntheticScene:
@@ -72,8 +76,9 @@ def make_scene(
         n of the n x n colour samples per pixel.
     n_points : int
         Sparse points; fewer when the views share too few surfaces.
-    point_noise : float
-        Standard deviation of the error of each point coordinate, metres.
+    point_noise : float, optional
+        Standard deviation of the error of each point coordinate, metres; by default the scene's own, which is 0 but for
+        ``noisy-sphere``.
     test_every : int
         In walking order the first of this many views is a test view, like in loaders; 0 for no test views.
     progress : callable
@@ -97,10 +102,11 @@ def make_scene(
     _at_least(8, width=width, height=height)
     if test_every == 1:
         raise InputError("test_every is 1, which leaves nothing to train on; give 0 for no test views, or 2 or more")
-    if not (0.0 <= point_noise < np.inf):
+    if point_noise is not None and not (0.0 <= point_noise < np.inf):
         raise InputError(f"point_noise is {point_noise}; give a finite number of metres, 0 or more")
     scene_rng, camera_rng, point_rng = np.random.default_rng(seed).spawn(3)
-    world, orbit = SETTINGS[name](scene_rng)
+    world, orbit, usual_noise = SETTINGS[name](scene_rng)
+    noise = usual_noise if point_noise is None else point_noise
     n_total = n_views + (-(-n_views // (test_every - 1)) if test_every else 0)
     cameras = orbit_cameras(orbit, n_total, width, height, camera_rng)
     traced = [trace_view(world, camera, supersampling) for camera in progress(cameras)]
@@ -108,8 +114,9 @@ def make_scene(
     test_ids = list(range(0, n_total, test_every)) if test_every else []
     train_ids = [i for i in range(n_total) if i not in test_ids]
 
+    train_traced, test_traced = ([traced[i] for i in ids] for ids in (train_ids, test_ids))
     points, colors, visibility = sample_points(
-        world, [cameras[i] for i in train_ids], [traced[i] for i in train_ids], n_points, point_noise, point_rng
+        world, [cameras[i] for i in train_ids], train_traced, n_points, noise, point_rng
     )
     train_centres = np.stack([cameras[i].center for i in train_ids])  # [V, 3]
     reach = np.linalg.norm(train_centres - train_centres.mean(axis=0), axis=1).max()
@@ -123,17 +130,25 @@ def make_scene(
         background=np.zeros(3),
         extent=EXTENT_MARGIN * float(reach),
     )
-    train_depths, train_normals = _stack_truth(traced, train_ids, width, height)
-    test_depths, test_normals = _stack_truth(traced, test_ids, width, height)
-    return SyntheticScene(scene, train_depths, test_depths, train_normals, test_normals, visibility, world)
+    train, test = (_stack_truth(own, width, height) for own in (train_traced, test_traced))
+    return SyntheticScene(
+        scene, train.depth, test.depth, train.normals, test.normals, train.ids, test.ids, visibility, world
+    )
 
 
-def _stack_truth(traced: Sequence[TracedView], ids: Sequence[int], width: int, height: int) -> tuple[Floats, Floats]:
-    """Return depths [n, H, W] and normals [n, H, W, 3] of some views; n may be 0."""
-    depths, normals = np.zeros((len(ids), height, width)), np.zeros((len(ids), height, width, 3))
-    for row, index in enumerate(ids):
-        depths[row], normals[row] = traced[index].depth, traced[index].normals
-    return depths, normals
+class _Truth(NamedTuple):
+    depth: Floats  # [n, H, W]
+    normals: Floats  # [n, H, W, 3]
+    ids: Ints  # [n, H, W]
+
+
+def _stack_truth(traced: Sequence[TracedView], width: int, height: int) -> _Truth:
+    """Return the truth of n views, which may be none."""
+    shape = (len(traced), height, width)
+    truth = _Truth(np.zeros(shape), np.zeros((*shape, 3)), np.zeros(shape, np.int16))
+    for row, view in enumerate(traced):
+        truth.depth[row], truth.normals[row], truth.ids[row] = view.depth, view.normals, view.ids
+    return truth
 
 
 def _at_least(least: int, **arguments: int) -> None:

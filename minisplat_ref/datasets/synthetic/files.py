@@ -1,13 +1,13 @@
 """Synthetic scenes, stage 9: a scene as a folder that every splatting program reads.
 
 ``images/*.png`` and ``sparse/0/{cameras,images,points3D}.txt`` are a COLMAP text model with tracks. The truth is beside
-it: ``depths/*.npy`` and ``normals/*.npy`` (float32), and ``scene_info.json``.
+it: ``depths/*.npy`` and ``normals/*.npy`` (float32), ``ids/*.npy`` (int16), and ``scene_info.json``.
 """
 
 import json
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,16 @@ def check_free(folder: Path) -> None:
         raise InputError(f"{folder} exists already; name a new folder or remove this one")
 
 
-def write_scene(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, Any]) -> None:
+def nothing_more(folder: Path) -> None:
+    """Write nothing."""
+
+
+def write_scene(
+    synthetic: SyntheticScene,
+    folder: Path,
+    settings: Mapping[str, Any],
+    write_more: Callable[[Path], None] = nothing_more,
+) -> None:
     """Write a scene, complete or not at all.
 
     Parameters
@@ -51,6 +60,8 @@ def write_scene(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, 
         A folder that does not exist or is empty.
     settings : mapping
         How the scene was made, for ``scene_info.json``.
+    write_more : callable
+        Writes further files into the folder, before it gets its name.
 
     Raises
     ------
@@ -64,6 +75,7 @@ def write_scene(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, 
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
             unfinished = Path(temporary) / "scene"
             _write_files(synthetic, unfinished, settings)
+            write_more(unfinished)
             if folder.exists():
                 folder.rmdir()
             os.replace(unfinished, folder)
@@ -116,16 +128,17 @@ def _write_files(synthetic: SyntheticScene, folder: Path, settings: Mapping[str,
     """Write everything into the folder."""
     scene = synthetic.scene
     model = folder / "sparse" / "0"
-    for subfolder in (folder / "images", folder / "depths", folder / "normals", model):
+    for subfolder in (folder / "images", folder / "depths", folder / "normals", folder / "ids", model):
         subfolder.mkdir(parents=True)
-    for views, depths, normals in (
-        (scene.train_views, synthetic.train_depths, synthetic.train_normals),
-        (scene.test_views, synthetic.test_depths, synthetic.test_normals),
+    for views, depths, normals, ids in (
+        (scene.train_views, synthetic.train_depths, synthetic.train_normals, synthetic.train_ids),
+        (scene.test_views, synthetic.test_depths, synthetic.test_normals, synthetic.test_ids),
     ):
-        for view, depth, normal in zip(views, depths, normals, strict=True):
+        for view, depth, normal, of_primitives in zip(views, depths, normals, ids, strict=True):
             write_image(folder / "images" / f"{view.name}.png", view.image)
             np.save(folder / "depths" / f"{view.name}.npy", depth.astype(np.float32))
             np.save(folder / "normals" / f"{view.name}.npy", normal.astype(np.float32))
+            np.save(folder / "ids" / f"{view.name}.npy", of_primitives)
 
     track_ids = [np.flatnonzero(row) for row in synthetic.point_visibility]  # of V views: the points that each sees
     tracks = dict(zip((view.name for view in scene.train_views), track_ids, strict=True))

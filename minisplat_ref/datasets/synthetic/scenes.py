@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 7: the four worlds. Metres, z up, the floor at z = 0.
+"""Synthetic scenes, stage 7: four worlds to render, and the list of all. Metres, z up, the floor at z = 0.
 
 ``room``: textured walls, furniture with thin rods, spheres and boxes. ``plain-wall``: walls without any texture fill
 most of the image. ``glossy``: polished things, whose look changes with the viewpoint. ``outdoor``: open ground with a
@@ -6,7 +6,6 @@ few objects under a sky that has no depth.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from minisplat_ref.datasets.synthetic.furniture import (
     tree,
 )
 from minisplat_ref.datasets.synthetic.geometry import Primitive
+from minisplat_ref.datasets.synthetic.lights import light_square, studio
 from minisplat_ref.datasets.synthetic.materials import (
     Bricks,
     Checker,
@@ -38,16 +38,8 @@ from minisplat_ref.datasets.synthetic.materials import (
 )
 from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Sphere
 from minisplat_ref.datasets.synthetic.tracer import World
+from minisplat_ref.datasets.synthetic.truths import Setting, box_city, facing_spheres, noisy_sphere, staircase
 from minisplat_ref.types import Floats
-
-
-class Setting(NamedTuple):
-    """A world and the camera path around it."""
-
-    world: World
-    """The surfaces and the light."""
-    orbit: Orbit
-    """The camera path."""
 
 
 def room(rng: np.random.Generator) -> Setting:
@@ -112,12 +104,12 @@ def glossy(rng: np.random.Generator) -> Setting:
     ]
     world = World(
         primitives=tuple(primitives),
-        light_positions=_light_square(np.array([1.8, -1.2, 3.6]), 0.25),
+        light_positions=light_square(np.array([1.8, -1.2, 3.6]), 0.25),
         light_color=linear_rgb("#fff2dd") * 0.85,
         light_reach=3.8,
         ambient_above=linear_rgb("#a9b4c4"),
         ambient_below=linear_rgb("#6a5a4d"),
-        sky=_studio,
+        sky=studio,
     )
     return Setting(world, Orbit(np.array([0.0, 0.0, 0.3]), (1.9, 2.3), (0.8, 1.9), 50.0))
 
@@ -142,7 +134,7 @@ def outdoor(rng: np.random.Generator) -> Setting:
     ]
     world = World(
         primitives=tuple(primitives),
-        light_positions=_light_square(np.array([60.0, -35.0, 70.0]), 1.5),
+        light_positions=light_square(np.array([60.0, -35.0, 70.0]), 1.5),
         light_color=linear_rgb("#fff0d2") * 1.0,
         light_reach=float(np.linalg.norm([60.0, -35.0, 70.0])),
         ambient_above=linear_rgb("#9fb6d8"),
@@ -157,6 +149,10 @@ SETTINGS: dict[str, Callable[[np.random.Generator], Setting]] = {
     "plain-wall": plain_wall,
     "glossy": glossy,
     "outdoor": outdoor,
+    "staircase": staircase,
+    "noisy-sphere": noisy_sphere,
+    "facing-spheres": facing_spheres,
+    "box-city": box_city,
 }
 """The scenes by name."""
 
@@ -169,7 +165,7 @@ def _lamp_world(primitives: list[Primitive]) -> World:
     )
     return World(
         primitives=(*primitives, panel),
-        light_positions=_light_square(lamp, 0.2),
+        light_positions=light_square(lamp, 0.2),
         light_color=linear_rgb("#fff3e0") * 0.72,
         light_reach=2.4,
         ambient_above=linear_rgb("#b3a99f"),
@@ -192,23 +188,6 @@ class _Sky:
         return clear + 0.85 * cover[:, None] * (1.0 - clear)
 
 
-def _studio(directions: Floats) -> Floats:
-    """A photographer's backdrop: dark floor to light ceiling, with two bright soft boxes to be mirrored."""
-    up = directions[:, 2:]  # [n, 1]
-    colors = linear_rgb("#3d4650") + (0.5 + 0.5 * up) * (linear_rgb("#c9d3dd") - linear_rgb("#3d4650"))
-    for towards, width in (((0.45, -0.3, 0.85), 0.16), ((-0.7, 0.6, 0.35), 0.1)):
-        unit = np.array(towards) / np.linalg.norm(towards)
-        glow = 1.0 / (1.0 + np.exp(-(directions @ unit - (1.0 - width**2)) / 0.004))
-        colors = colors + 0.8 * glow[:, None] * linear_rgb("#fff6e6")
-    return colors
-
-
 def _polish(texture: Texture, reflectance: float) -> Material:
     """A lacquered or metallic surface."""
     return Material(texture, highlight=0.8, shininess=120.0, reflectance=reflectance)
-
-
-def _light_square(centre: Floats, half: float) -> Floats:
-    """[4, 3] samples of a square light that faces down."""
-    corners = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
-    return centre + half * corners

@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 4: light. Ray-trace one view of a world: colour, exact depth, exact normals.
+"""Synthetic scenes, stage 4: light. Ray-trace one view of a world: colour, exact depth, normals and ids.
 
 The model is Lambert's law under one small area light with shadows, a sky-to-ground gradient of ambient light,
 Blinn-Phong highlights, and mirror reflections with Schlick's Fresnel term. Left out: indirect light beyond one
@@ -59,6 +59,8 @@ class TracedView(NamedTuple):
     """[H, W] float64 camera z at pixel centres, world units; 0 at the sky."""
     normals: Floats
     """[H, W, 3] float64 unit normals towards the camera at pixel centres, world frame; 0 at the sky."""
+    ids: Ints
+    """[H, W] int16 index of the world's primitive at pixel centres; -1 at the sky."""
 
 
 def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
@@ -76,7 +78,7 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     Returns
     -------
     TracedView
-        Colour, depth and normals.
+        Colour, depth, normals and ids.
     """
     origin = camera.center
     offsets = (np.arange(supersampling) + 0.5) / supersampling  # [n] pixels from the pixel's edge
@@ -98,7 +100,8 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     normals = facing_normals(world.primitives, hits, points, directions)
     # Directions have camera z = 1, so the ray parameter is the depth itself.
     depth = np.where(hits.primitive_ids >= 0, hits.distances, 0.0)
-    return TracedView(image, depth.reshape(image.shape[:2]), normals.reshape(image.shape))
+    shape = image.shape[:2]
+    return TracedView(image, depth.reshape(shape), normals.reshape(image.shape), hits.primitive_ids.reshape(shape))
 
 
 def pixel_rays(camera: Camera, offset_x: float, offset_y: float, image_rows: Ints) -> Floats:

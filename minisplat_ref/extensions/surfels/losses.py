@@ -14,7 +14,7 @@ renderer's channel ``spread``, the sum in L_d is ``b^2 (A S_2 - S_1^2)``, ``b = 
 
 import numpy as np
 
-from minisplat_ref.mechanisms.surfels.depth_normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 from minisplat_ref.types import Floats

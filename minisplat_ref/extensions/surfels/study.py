@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.mechanisms.surfels.depth_normals import central_normals
+from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.rendering import RenderSettings

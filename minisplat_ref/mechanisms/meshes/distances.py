@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from minisplat_ref.mechanisms.oriented.thin_axis import angles_between
 from minisplat_ref.types import Floats, Ints
 
 
@@ -71,10 +72,9 @@ def compare_surfaces(found: OrientedPoints, truth: OrientedPoints, tau: float) -
     to_truth, nearest = cKDTree(truth.points).query(found.points)
     to_found, _ = cKDTree(found.points).query(truth.points)
     precision, recall = float(np.mean(to_truth <= tau)), float(np.mean(to_found <= tau))
-    cosines = np.abs(np.sum(found.normals * truth.normals[nearest], axis=1))
     return Distances(
         float(to_truth.mean()),
         float(to_found.mean()),
         2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
-        float(np.degrees(np.arccos(np.minimum(cosines, 1))).mean()),
+        float(angles_between(found.normals, truth.normals[nearest]).mean()),
     )

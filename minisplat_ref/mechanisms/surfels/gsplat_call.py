@@ -19,7 +19,7 @@ from minisplat_ref.constants import GSPLAT_1_5, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.gsplat_arguments import TILE_SIZE, Batch, Options, Views, split_batches
 from minisplat_ref.gsplat_compat import remove_rotation
-from minisplat_ref.mechanisms.surfels.depth_normals import LENGTH_MIN, central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.depth_maps.normals import LENGTH_MIN, central_normals, central_normals_vjp
 from minisplat_ref.mechanisms.surfels.projection import GSPLAT, SurfelGradient, Surfels, project, project_vjp
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.renderer import Shown, list_tiles
