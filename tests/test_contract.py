@@ -48,6 +48,8 @@ ARGUMENTS_MAX = 8  # positional; what belongs together is a NamedTuple
 MANY_ARGUMENTS = {
     "rasterization": "gsplat's own call, argument by argument",
     "rasterization_vjp": "the arguments of rasterization and the cotangents",
+    "rasterization_2dgs": "gsplat's own call, argument by argument",
+    "rasterization_2dgs_vjp": "the arguments of rasterization_2dgs",
 }
 
 

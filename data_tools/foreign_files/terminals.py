@@ -135,7 +135,7 @@ def _quiet(folder: Path) -> None:
 
 def _estimated(folder: Path) -> None:
     """The time of the first iteration, which compiles, is not in the estimate of the rest."""
-    state = SimpleNamespace(gaussians=gaussians())
+    state = SimpleNamespace(layout=gaussians())
     view = SimpleNamespace(image=np.zeros((2, 2, 3), np.uint8), mask=None)
     output = SimpleNamespace(image=np.zeros((2, 2, 3)))
 

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
+from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
 from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, project
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS, list_tiles
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
