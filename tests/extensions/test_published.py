@@ -249,6 +249,38 @@ FANS = {
     ),
 }
 
+GDGS = {
+    **GS_ACCEL,
+    **rows(
+        "GDGS, the schedule of training",
+        surface_attraction=(1.0, 5_001),
+        surface_attraction__period=100,
+        dispersion=(0.001, 10_001),
+        dispersion__period=100,
+        contraction=(0.0, 10_001),
+        contraction__period=100,
+        dispersion__is_printed=False,
+        contraction__is_printed=True,
+        collect_gradients=[steps(1, 30_000)],
+        clone_and_split=[steps(600, 9_900, 100)],
+        control_by_region=[steps(10_000, 29_900, 100)],
+    ),
+    **rows("3DGS, section 5.2", control_by_region__threshold=2e-4),
+    **rows(
+        f"{OURS}: the paper gives neither weights nor sizes of regions",
+        surface_attraction__weights=(1.0, 0.01, 0.0),
+        surface_attraction__offset=0.0,
+        dispersion__n_cells=5,
+        dispersion__n_top=20,
+        contraction__n_cells=5,
+        contraction__n_top=20,
+        control_by_region__n_cells=5,
+        control_by_region__min_unevenness=1.0,
+        control_by_region__jitter=0.1,
+        control_by_region__min_gap=100,
+    ),
+}
+
 TABLES = {
     "3dgs": GS,
     "3dgs-accel": GS_ACCEL,
@@ -274,6 +306,7 @@ TABLES = {
         set_width__width=[0.5, 0.0],
     ),
     "fans": FANS,
+    "gdgs": GDGS,
     "micro": MICRO,
     "mixed": GS_ACCEL
     | rows(
