@@ -132,6 +132,11 @@ ORDER = (
                 (19,),
                 "textures and sharp edges; lines, polygons, meshes",
             ),
+            Step(
+                ("mechanisms/surfels/", "extensions/surfels/", "extensions/gdgs/", "mechanisms/fusion/"),
+                (21,),
+                "discs with depths and normals; from depth maps to a mesh",
+            ),
         ),
     ),
     Part(
