@@ -233,11 +233,64 @@ axes[1].set(
 _ = figure
 
 # %% [markdown]
+# ## Play
+#
+# Change the size and the opacity of the ball's discs, and run the cell. Discs that are too small or too clear let the
+# far side shine through; its depths are mixed into the mean, though hardly into the median.
+
+# %%
+size, opacity = 0.03, 0.6
+thin = flat(center + sphere, sphere, np.full(len(k), size), np.full(len(k), opacity), stripes)
+output, channels = drawn(thin)
+figure, axes = plt.subplots(1, 3, figsize=(8, 2.1))
+show(axes[0], channels["rgb"], "colours")
+is_dense = output.alpha > 0.5
+mean = np.where(is_dense, expected_depth(channels["depth"][..., 0], output.alpha), np.nan)
+median = np.where(is_dense, channels["median"][..., 0], np.nan)
+show(axes[1], mean, "mean depth", cmap="viridis", vmin=3, vmax=5)
+show(axes[2], median, "median depth", cmap="viridis", vmin=3, vmax=5)
+_ = figure
+
+# %% [markdown]
+# ## Exercises
+#
+# 1. Where does a disc stop being seen as a disc? Find the angle at which half of the alpha that is left comes from the
+#    low-pass, for the disc that turned above.
+#
+# <details><summary>Solution</summary>
+#
+# At some 80 degrees: there the sums with and without the low-pass differ by half.
+#
+# ```python
+# whole, alone = (np.array(stopped[name]) for name in ("with the low-pass", "the disc alone"))
+# half = np.degrees(angles[np.argmax(alone < whole / 2)])
+# assert 70 < half < 85
+# ```
+#
+# </details>
+#
+# 2. Why is distortion the same if 5 is added to every q?
+#
+# <details><summary>Solution</summary>
+#
+# Only differences of q count. The renderer uses this: it subtracts an inverse depth amid those of the view, so that
+# ``A S2`` and ``S1^2`` are not two large numbers with a small difference.
+#
+# ```python
+# w, q = np.array([0.5, 0.4]), np.array([1 / 3, 1 / 4])
+# sums = [w.sum() * np.sum(w * (q + c) ** 2) - np.sum(w * (q + c)) ** 2 for c in (0, 5)]
+# assert np.isclose(*sums) and np.isclose(sums[0], w[0] * w[1] * (q[0] - q[1]) ** 2)
+# ```
+#
+# </details>
+
+# %% [markdown]
 # ## What was shown
 
 # %%
+# One depth for all pixels of a Gaussian, that of the plane for each of a surfel.
 is_seen = ~np.isnan(depths["surfel"][20])
-assert np.nanmax(depths["3DGS"]) - np.nanmin(depths["3DGS"]) < 1e-9  # one depth for all pixels
+assert np.nanmax(depths["3DGS"]) - np.nanmin(depths["3DGS"]) < 1e-9
 np.testing.assert_allclose(depths["surfel"][20][is_seen], true_depth[is_seen], rtol=0.05)
 assert stopped["the disc alone"][-1] < 1e-6 < 1 < stopped["with the low-pass"][-1]
 assert np.median(cosines) > 0.95 and is_surface.sum() > 200
@@ -245,7 +298,4 @@ np.testing.assert_allclose(from_channels, over_pairs, atol=1e-3)
 spread = {name: np.linalg.norm(end - end.mean(axis=0), axis=1).mean() for name, end in moved.items()}
 assert spread["as printed"] < 0.8 * spread["at the start"] < spread["repulsive"]
 assert 0 < np.median(error) < 0.75 * grid.voxel  # a little too large
-
-# %% [markdown]
-# **Exercise.** Make the discs of the ball twice as large. What happens to the normals of the discs, and what to those
-# from depths? Which of the two losses would notice?
+print("all of the above holds")
