@@ -119,6 +119,18 @@ def test_nothing_behind_the_camera_is_drawn(backend):
     assert is_hit.any() and depth.min() > GSPLAT_MAIN.near_plane
 
 
+def test_hits_before_the_near_plane_are_dropped_one_by_one(backend):
+    """A wall that recedes to the right is cut where it is nearer than the near plane, though its centre is not."""
+    wall = surfels_at([[0, 0, 4.0]], [[np.cos(0.2), 0, np.sin(0.2), 0]], [1e3], [0.9])
+    request = Request(conventions=GSPLAT_MAIN._replace(near_plane=3.95), backend=backend)
+    output, tape = SURFELS.render(Model(wall), view_from(CAMERA), request)
+    n = tape.shown.surfels.normals[0]
+    rays = pinhole_rays(np.arange(24) + 0.5, np.arange(18)[:, None] + 0.5, CAMERA)
+    z = 4 * n[2] / (rays @ n)
+    assert (z < 3.9).any() and (z > 4).any()
+    np.testing.assert_array_equal(output.alpha > 0, z > 3.95)
+
+
 def test_a_box_holds_all_that_is_visible(rng):
     """Alpha is below its least outside of every box; large discs reach behind the camera."""
     g = make_gaussians(rng, 40, size=0.5)
