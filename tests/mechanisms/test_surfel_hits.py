@@ -119,6 +119,18 @@ def test_nothing_behind_the_camera_is_drawn(backend):
     assert is_hit.any() and depth.min() > GSPLAT_MAIN.near_plane
 
 
+def test_density_control_hears_of_the_centre_in_pixels(backend, rng):
+    """Discs that face the camera move by z / f for a pixel: large ones are hit themselves, tiny ones by the low-pass."""
+    means = np.column_stack([rng.uniform(-0.8, 0.8, (8, 2)), rng.uniform(3, 5, 8)])
+    g = surfels_at(means, [[1.0, 0, 0, 0]] * 8, [0.5, 1e-6] * 4, [0.5] * 8)
+    g = g._replace(sh_dc=rng.normal(size=(8, 3)))
+    output, tape, _ = drawn(g, backend=backend, wants=frozenset())
+    v = SURFELS.render_vjp(tape, rng.normal(size=output.image.shape))
+    expected = v.gaussians.means[:, :2] * means[:, 2:] / (CAMERA.fx, CAMERA.fy)
+    assert np.abs(expected).max(axis=1).min() > 1e-3
+    assert_allclose(v.means2d, expected, rtol=1e-7, atol=1e-10)
+
+
 def test_hits_before_the_near_plane_are_dropped_one_by_one(backend):
     """A wall that recedes to the right is cut where it is nearer than the near plane, though its centre is not."""
     wall = surfels_at([[0, 0, 4.0]], [[np.cos(0.2), 0, np.sin(0.2), 0]], [1e3], [0.9])
