@@ -120,7 +120,7 @@ def test_nothing_behind_the_camera_is_drawn(backend):
 
 
 def test_density_control_hears_of_the_centre_in_pixels(backend, rng):
-    """Discs that face the camera move by z / f for a pixel: large ones are hit themselves, tiny ones by the low-pass."""
+    """Discs that face the camera move by z / f for a pixel: large ones are met, tiny ones only their low-pass."""
     means = np.column_stack([rng.uniform(-0.8, 0.8, (8, 2)), rng.uniform(3, 5, 8)])
     g = surfels_at(means, [[1.0, 0, 0, 0]] * 8, [0.5, 1e-6] * 4, [0.5] * 8)
     g = g._replace(sh_dc=rng.normal(size=(8, 3)))

@@ -15,6 +15,7 @@ from minisplat_ref.mechanisms.surfels.oracle.comparison import STAGES, choose_re
 from minisplat_ref.mechanisms.surfels.oracle.hard_cases import CASES, run_surfel_cases, select
 from minisplat_ref.mechanisms.surfels.oracle.planted import PLANTED
 from minisplat_ref.mechanisms.surfels.oracle.scenes import scenes
+from tolerances import GRADIENT_STEP_IMAGE
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("torch", "gsplat"))
 
@@ -63,6 +64,29 @@ def test_every_cotangent_counts(known):
     ]
     assert len(parts) == len(NAMES) and min(np.abs(part).max() for part in parts) > 1e-3
     np.testing.assert_allclose(sum(parts), known["ordinary"][1]["v_means"], atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "D", "RGB+D"])
+def test_gradients_in_every_mode_are_those_of_what_is_computed(mode, known, rng):
+    """Along a direction in the means: in RGB the median is read from the last colour, and there is no depth."""
+    given = {**known["ordinary"][0].arguments, "render_mode": mode, "distloss": False}
+    given["backgrounds"] = given["backgrounds"] if mode.startswith("RGB") else np.zeros((1, 3))
+    images = rasterization_2dgs(**given)
+    cotangents = {
+        f"v_{name}": rng.normal(size=image.shape)
+        for name, image in zip(NAMES, images[:6], strict=True)
+        if image is not None
+    }
+    direction = rng.normal(size=given["means"].shape)
+
+    def loss(step):
+        moved = rasterization_2dgs(**{**given, "means": given["means"] + step * direction})
+        return sum(np.sum(cotangents[f"v_{n}"] * x) for n, x in zip(NAMES, moved[:6], strict=True) if x is not None)
+
+    difference = (loss(GRADIENT_STEP_IMAGE) - loss(-GRADIENT_STEP_IMAGE)) / (2 * GRADIENT_STEP_IMAGE)
+    v = rasterization_2dgs_vjp(**given, cotangents=cotangents)["v_means"]
+    assert abs(difference) > 1
+    np.testing.assert_allclose(np.sum(v * direction), difference, rtol=1e-4)
 
 
 def test_a_batch_of_scenes_is_its_scenes_one_by_one(known):
