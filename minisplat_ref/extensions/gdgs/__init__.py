@@ -1,4 +1,4 @@
-"""GDGS: start on local planes, be drawn to the surface, densify by regions.
+"""GDGS: Gaussians start on local planes, are pulled to them, and are densified by regions.
 
 This follows GDGS, 2025, arXiv 2507.00363. A network that maps noisy points of the scene to the points themselves gives
 the first centres, and principal axes of the nearest neighbours give each Gaussian its plane. In one of a hundred

@@ -149,4 +149,4 @@ GDGS = GS_ACCEL._replace(
         ),
     ),
 )
-"""``gdgs``: 3DGS that starts on local planes, is drawn to them, and densifies by regions from a third on."""
+"""``gdgs``: 3DGS that starts on local planes, is pulled to them, and from iteration 10,000 on densifies by regions."""

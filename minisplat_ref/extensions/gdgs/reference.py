@@ -37,12 +37,12 @@ class Attraction(NamedTuple):
 def attract(population: Any, planes: LocalPlanes, weights: Weights, offset: float, unit: float) -> Attraction:
     """Return how far primitives are from the planes of their nearest points, and turned away from them.
 
-    With the nearest point's plane (m, N), the shortest axis U and the distance d of the target ``mu* = foot + d N``::
+    With the nearest point's plane (m, N), the shortest axis U and the target ``mu*`` at the distance d from the plane::
 
         e_i = (mu_i - m) . N - d
         L   = l_d mean(e_i^2) + l_a mean(1 - |U . N|) + l_s mean(|mu_i - m|^2)         lengths in ``unit``
 
-        v_mu = (2 l_d e N + 2 l_s (mu - m)) / (N unit^2),   v_U = -l_a sign(U . N) N / N
+        v_mu = 2 (l_d e N + l_s (mu - m)) / n,   v_U = -l_a sign(U . N) N / n         of n primitives
 
     Because ``mu - mu*`` is along N, the gradient is the same with the target held constant. The paper's sum over
     neighbours is here over the mean m of the nearest point's neighbours, which has the same gradient up to a factor.

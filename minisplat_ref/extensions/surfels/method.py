@@ -8,7 +8,7 @@ from minisplat_ref.extensions.surfels.losses import LOSSES
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, prune_faint
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.training.schedule import Event, Every
+from minisplat_ref.training.schedule import Event, Every, does
 from minisplat_ref.types import Gaussians
 
 LOG_THICKNESS = -16.0  # 1e-7 world units: what other programs draw, and where children of a split are placed
@@ -27,8 +27,8 @@ DISCS = Representation("surfels", extend=as_surfels, renderer=SURFELS)
 
 
 def _with_opacity_min(event: Event) -> Event:
-    """Return the event; pruning of faint Gaussians with the released bound."""
-    if isinstance(event, Every) and getattr(event.action, "func", None) is prune_faint:
+    """Return an event of 3DGS, with the released bound of opacity if it prunes faint Gaussians."""
+    if isinstance(event, Every) and does(event, prune_faint):
         return event._replace(action=partial(prune_faint, min_opacity=OPACITY_MIN))
     return event
 

@@ -59,7 +59,7 @@ class Surfels(NamedTuple):
     """[N] o."""
     depths: Floats
     """[N] of the centres, camera z, world units; the order of the lists. Where ``rules.has_hit_depths`` is false this
-    is also the depth of every hit, unless somebody replaced it by other values to measure along the rays."""
+    is also the depth of every hit; a caller may replace it by other values to be measured along the rays."""
     normals: Floats
     """[N, 3] unit, camera frame, towards the camera."""
     radii: Ints

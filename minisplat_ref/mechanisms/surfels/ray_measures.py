@@ -6,9 +6,9 @@ With the weights w_i and depths z_i of a pixel's hits, front to back, and ``T_i`
     distortion = sum_ij w_i w_j |z_i - z_j| = 2 sum_i w_i (z_i A_i - M_i)
     A_i        = sum_{j<i} w_j,   M_i = sum_{j<i} w_j z_j
 
-The second form holds where depths never fall along the ray; where they do, gsplat computes it all the same, and so do
-we. It is the distortion of Mip-NeRF 360; that of 2D Gaussian Splatting squares the difference and needs no order (see
-:class:`minisplat_ref.mechanisms.surfels.response.Layout`).
+The second form holds where depths never fall along the ray; where they do, gsplat computes it all the same, and so
+does this module. It is the distortion of Mip-NeRF 360; that of 2D Gaussian Splatting squares the difference and needs
+no order (see :class:`minisplat_ref.mechanisms.surfels.response.Layout`).
 """
 
 from typing import NamedTuple
