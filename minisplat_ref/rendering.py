@@ -31,6 +31,7 @@ from minisplat_ref.types import (
     Primitives,
     Projection,
     RenderOutput,
+    SHGradient,
     View,
 )
 
@@ -164,13 +165,55 @@ def activate(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
     return Primitives(gaussians.means, gaussians.quats, scales, opacities)
 
 
-def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`: the stages' gradients in reverse order.
+def activate_vjp(
+    primitives: Primitives, opacity_logits: Floats, v_scales: Floats, v_opacities: Floats
+) -> tuple[Floats, Floats]:
+    """Return the gradients of logarithms of scales [N, 3] and of logits [N] from those of :func:`activate`'s results.
 
     ::
 
         v_log_s = s v_s,  v_logit = o (1 - o) v_o
-        the means and the pose have two terms each, from the projection and from the viewing direction
+    """
+    with np.errstate(over="ignore"):
+        transparencies = 1 / (1 + np.exp(opacity_logits))  # 1 - o, without the cancellation of 1 - 0.9999
+    return primitives.scales * v_scales, primitives.opacities * transparencies * v_opacities
+
+
+def parameters_vjp(gaussians: Any, primitives: Primitives, v_primitives: Any, v_sh: SHGradient) -> Any:
+    """Return the gradient of a population from those of its primitives and of its colours.
+
+    Colours depend on the means, by the viewing direction: the means have two terms. Fields beyond the six of
+    :class:`Gaussians` have none here.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Or any population that has its six fields.
+    primitives : Primitives
+        From :func:`activate`.
+    v_primitives : PrimitiveGradient
+        Or any tuple with ``means``, ``quats``, ``scales`` and ``opacities``.
+    v_sh : SHGradient
+        From the backend's ``sh_colors_vjp``.
+    """
+    logits = gaussians.opacity_logits
+    v_log_scales, v_logits = activate_vjp(primitives, logits, v_primitives.scales, v_primitives.opacities)
+    further = set(gaussians._fields) - set(Gaussians._fields)
+    return gaussians._replace(
+        means=v_primitives.means + v_sh.means,
+        quats=v_primitives.quats,
+        log_scales=v_log_scales,
+        opacity_logits=v_logits,
+        sh_dc=v_sh.sh_dc,
+        sh_rest=v_sh.sh_rest,
+        **{name: np.zeros_like(getattr(gaussians, name)) for name in further},
+    )
+
+
+def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render`: the stages' gradients in reverse order.
+
+    The means and the pose have two terms each, from the projection and from the viewing direction.
 
     Parameters
     ----------
@@ -187,25 +230,13 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
         Zeros for Gaussians that were not visible.
     """
     g, splats = tape.gaussians, tape.splats
-    scales, opacities = splats.primitives.scales, splats.primitives.opacities
     v_alpha = np.zeros_like(splats.output.alpha) if v_alpha is None else v_alpha
-    with np.errstate(over="ignore"):
-        transparencies = 1 / (1 + np.exp(g.opacity_logits))  # 1 - o, without the cancellation of 1 - 0.9999
     v = splat_vjp(splats, v_image, v_alpha)
     v_sh = splats.backend.sh_colors_vjp(
         g.means, g.sh_dc, g.sh_rest, splats.camera, tape.sh_degree, splats.projection.radii, v.colors
     )
-    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}
     return RenderGradient(
-        gaussians=g._replace(
-            means=v.primitives.means + v_sh.means,
-            quats=v.primitives.quats,
-            log_scales=scales * v.primitives.scales,
-            opacity_logits=opacities * transparencies * v.primitives.opacities,
-            sh_dc=v_sh.sh_dc,
-            sh_rest=v_sh.sh_rest,
-            **further,
-        ),
+        gaussians=parameters_vjp(g, splats.primitives, v.primitives, v_sh),
         background=v.background,
         cam_from_world_R=v.primitives.cam_from_world_R + v_sh.cam_from_world_R,
         cam_from_world_t=v.primitives.cam_from_world_t + v_sh.cam_from_world_t,

@@ -39,7 +39,7 @@ def test_distortion_of_two_hits():
     q, w = np.array([1 / 2, 1 / 4]), np.array([0.5, 0.25])
     value, v = distortion(rendered(0.75, spread=np.stack([np.sum(w * q), np.sum(w * q * q)])))
     m = 100 / 99.8 * (1 - 0.2 * q)
-    assert_allclose(value, 0.125 * (m[0] - m[1]) ** 2, rtol=1e-12)
+    assert_allclose(value, 0.125 * (m[0] - m[1]) ** 2, rtol=CLOSED_FORM)
     b2 = (0.2 * 100 / 99.8) ** 2 / 20
     assert_allclose(v.alpha, b2 * np.sum(w * q * q), rtol=CLOSED_FORM)
     assert_allclose(
@@ -59,8 +59,8 @@ def test_normals_that_agree_with_the_surface_cost_nothing_but_the_border():
     for function, depth in ((normal_consistency, {"depth": 0.8 * 3}), (median_normal_consistency, {"median": 3})):
         same, _ = function(rendered(0.8, normal=facing, **depth))
         other, _ = function(rendered(0.8, normal=turned, **depth))
-        assert_allclose(same, 0.8 * 14 / 20, rtol=1e-12)  # 14 of 20 pixels are on the border
-        assert_allclose(other - same, 0.8 * (1 - np.cos(0.3)) * 6 / 20, rtol=1e-12)
+        assert_allclose(same, 0.8 * 14 / 20, rtol=CLOSED_FORM)  # 14 of 20 pixels are on the border
+        assert_allclose(other - same, 0.8 * (1 - np.cos(0.3)) * 6 / 20, rtol=CLOSED_FORM)
 
 
 def test_no_normal_beside_a_hole():
@@ -68,7 +68,7 @@ def test_no_normal_beside_a_hole():
     scene.output.alpha[1, 2] = 0
     value, v = normal_consistency(scene)
     # The hole's own neighbours lose their N: (1, 1), (1, 3), (2, 2); the hole itself has opacity 0, but its N stays.
-    assert_allclose(value, (0.8 * 19 - 0.8 * 3) / 20, rtol=1e-12)
+    assert_allclose(value, (0.8 * 19 - 0.8 * 3) / 20, rtol=CLOSED_FORM)
     assert v.channels["normal"][2, 2].sum() == 0 and v.channels["normal"][2, 1].sum() != 0
 
 

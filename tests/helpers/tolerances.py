@@ -199,6 +199,16 @@ CUDA_FLOAT32_GRADIENT = 1e-4
 # The depth of a plane a thousand times as large as the image: the map from image to disc has a condition of 1e4.
 SURFEL_PLANE = 1e-10
 
+# One surfel against its closed form: homogeneous planes of coordinates of order 1e2 px, whose products lose three
+# digits of 1e-16, and a division by what is left.
+SURFEL_HIT = 1e-9
+
+# The same for surfels of 1e-6 and 1e-7 units, whose images are their low-pass: what the disc itself adds is left out.
+SURFEL_POINT = 1e-7
+
+# A disc of a thousand units stands for a plane, and its Gaussian falls by this within the image.
+SURFEL_WIDE = 1e-4
+
 # Gradients of surfels in float32, beside the 2e-5 of others: grazing hits divide by the angle, inverse depths by z^2.
 SURFEL_FLOAT32_GRADIENT = 5e-4
 

@@ -19,7 +19,16 @@ from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request, activate
 from minisplat_ref.types import Camera, Gaussians, Model, Primitives, view_from
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, SURFEL_FLOAT32_GRADIENT, SURFEL_PLANE
+from tolerances import (
+    CLOSED_FORM,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+    SURFEL_FLOAT32_GRADIENT,
+    SURFEL_HIT,
+    SURFEL_PLANE,
+    SURFEL_POINT,
+    SURFEL_WIDE,
+)
 
 WANTS = frozenset(CHANNELS)
 EDGE_ON = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
@@ -50,11 +59,13 @@ def test_a_plane_has_the_depths_and_the_normal_of_a_plane(backend):
     z = (n @ mean) / (rays @ n)
     assert n @ mean < 0 and np.ptp(z) > 0.5
     alpha = output.alpha
-    assert_allclose(alpha, 0.8, rtol=1e-4)
+    assert_allclose(alpha, 0.8, rtol=SURFEL_WIDE)
     assert_allclose(output.image[..., channels["depth"]][..., 0], alpha * z, rtol=SURFEL_PLANE)
     assert_allclose(output.image[..., channels["normal"]], alpha[..., None] * n, rtol=SURFEL_PLANE, atol=1e-15)
     assert_allclose(output.median_depth, z, rtol=SURFEL_PLANE)
-    assert_allclose(central_normals(z, CAMERA)[1:-1, 1:-1], np.broadcast_to(n, (16, 22, 3)), rtol=1e-9, atol=1e-12)
+    assert_allclose(
+        central_normals(z, CAMERA)[1:-1, 1:-1], np.broadcast_to(n, (16, 22, 3)), rtol=SURFEL_HIT, atol=1e-12
+    )
 
 
 def test_a_sphere_of_tangent_surfels_has_its_depths_and_normals(backend):
@@ -73,10 +84,10 @@ def test_a_sphere_of_tangent_surfels_has_its_depths_and_normals(backend):
     output, _, channels = drawn(surfels_at(points, quats, scales, opacities), backend=backend)
     shown = output.image[is_met]
     assert len(n) > 8 and np.ptp(t) > 0.4
-    assert_allclose(output.alpha[is_met], 0.9, rtol=1e-9)
-    assert_allclose(shown[:, channels["depth"]][:, 0], 0.9 * t, rtol=1e-9)
-    assert_allclose(shown[:, channels["normal"]], 0.9 * n, rtol=1e-9, atol=1e-9)
-    assert_allclose(output.median_depth[is_met], t, rtol=1e-9)
+    assert_allclose(output.alpha[is_met], 0.9, rtol=SURFEL_HIT)
+    assert_allclose(shown[:, channels["depth"]][:, 0], 0.9 * t, rtol=SURFEL_HIT)
+    assert_allclose(shown[:, channels["normal"]], 0.9 * n, rtol=SURFEL_HIT, atol=SURFEL_HIT)
+    assert_allclose(output.median_depth[is_met], t, rtol=SURFEL_HIT)
 
 
 def test_below_a_pixel_only_the_low_pass_is_left(backend):
@@ -84,14 +95,14 @@ def test_below_a_pixel_only_the_low_pass_is_left(backend):
     output, _, channels = drawn(surfels_at([[0.0, 0.0, 4.0]], [[1.0, 0.1, 0.2, 0]], [1e-7], [0.9]), backend=backend)
     dx, dy = np.arange(24) + 0.5 - 12.3, np.arange(18)[:, None] + 0.5 - 9.1
     alpha = 0.9 * np.exp(-(dx**2) - dy**2)
-    assert_allclose(output.alpha, np.where(alpha >= 1 / 255, alpha, 0), rtol=1e-7, atol=1e-15)
+    assert_allclose(output.alpha, np.where(alpha >= 1 / 255, alpha, 0), rtol=SURFEL_POINT, atol=1e-15)
     assert_allclose(output.image[..., channels["depth"]][..., 0], 4 * output.alpha, rtol=CLOSED_FORM)
 
 
 def test_seen_from_its_edge_a_disc_is_its_low_pass(backend):
     output, _, _ = drawn(surfels_at([[0.0, 0.0, 4.0]], [EDGE_ON], [0.5], [0.9]), backend=backend)
     y, x = 8, 11
-    assert_allclose(output.alpha[y, x], 0.9 * np.exp(-((x + 0.5 - 12.3) ** 2) - (y + 0.5 - 9.1) ** 2), rtol=1e-9)
+    assert_allclose(output.alpha[y, x], 0.9 * np.exp(-((x + 0.5 - 12.3) ** 2) - (y + 0.5 - 9.1) ** 2), rtol=SURFEL_HIT)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -105,7 +116,7 @@ def test_either_side_of_the_switch(side, backend):
     assert_allclose(c, (12.5 - d, 9.5), rtol=CLOSED_FORM)
     rho = min((d * z / (f * s)) ** 2, 2 * d * d)
     assert (rho < 2 * d * d) == (side == 1)
-    assert_allclose(output.alpha[9, 12], 0.9 * np.exp(-rho / 2), rtol=1e-9)
+    assert_allclose(output.alpha[9, 12], 0.9 * np.exp(-rho / 2), rtol=SURFEL_HIT)
 
 
 def test_nothing_behind_the_camera_is_drawn(backend):
@@ -128,7 +139,7 @@ def test_density_control_hears_of_the_centre_in_pixels(backend, rng):
     v = SURFELS.render_vjp(tape, rng.normal(size=output.image.shape))
     expected = v.gaussians.means[:, :2] * means[:, 2:] / (CAMERA.fx, CAMERA.fy)
     assert np.abs(expected).max(axis=1).min() > 1e-3
-    assert_allclose(v.means2d, expected, rtol=1e-7, atol=1e-10)
+    assert_allclose(v.means2d, expected, rtol=SURFEL_POINT, atol=1e-10)
 
 
 def test_hits_before_the_near_plane_are_dropped_one_by_one(backend):
@@ -198,7 +209,7 @@ def test_what_rays_measure_is_a_sum_over_pairs(rules, module, rng):
             pairs = sum(w[i] * w[j] * abs(z[i] - z[j]) for i, j in itertools.product(range(len(w)), repeat=2))
             median = [z[i] for i in range(len(w)) if front[i] > 0.5][-1:] or [0.0]
             at = tile.ys[k], tile.xs[k]
-            assert_allclose(measures.distortion[at], pairs, rtol=1e-9, atol=1e-14)
+            assert_allclose(measures.distortion[at], pairs, rtol=SURFEL_HIT, atol=1e-14)
             assert_allclose(measures.median[at], median[0], rtol=CLOSED_FORM)
             n_looked_at += len(rows) > 2
     assert n_looked_at > 5
@@ -215,7 +226,7 @@ def test_spread_gives_the_squared_distortion_whatever_the_offset(rng):
         for k in range(0, w.shape[1], 11):
             q = 1 / tile.hit.depths[:, k]
             pairs = np.sum(w[:, None, k] * w[None, :, k] * (q[:, None] - q) ** 2) / 2
-            assert_allclose(got[tile.ys[k], tile.xs[k]], pairs, rtol=1e-9, atol=1e-14)
+            assert_allclose(got[tile.ys[k], tile.xs[k]], pairs, rtol=SURFEL_HIT, atol=1e-14)
             n_looked_at += pairs > 1e-6
     assert n_looked_at > 10
 
@@ -226,7 +237,7 @@ def test_colors_are_those_of_the_harmonics_and_the_background_shines_through(bac
     request = Request(np.array([0.2, 0.4, 0.6]), backend=backend)
     output, _ = SURFELS.render(Model(g), view_from(CAMERA), request)
     expected = 0.75 * (0.5 + SH_C0 * g.sh_dc[0]) + 0.25 * request.background
-    assert_allclose(output.image[9, 12], expected, rtol=1e-5)
+    assert_allclose(output.image[9, 12], expected, rtol=SURFEL_WIDE)
 
 
 def test_what_surfels_do_not_have_is_refused(rng):

@@ -18,7 +18,16 @@ from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, RenderTape, Request, activate, choose_degree
+from minisplat_ref.rendering import (
+    SPLATTING,
+    Renderer,
+    RenderGradient,
+    RenderTape,
+    Request,
+    activate,
+    activate_vjp,
+    choose_degree,
+)
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -181,12 +190,7 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
 
 
 def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`_render`, the sum of those through the projection, the colours and the payload.
-
-    ::
-
-        v_log_s = s v_s,  v_logit = o (1 - o) v_o
-    """
+    """Gradient of :func:`_render`, the sum of those through the projection, the colours and the payload."""
     if isinstance(tape, RenderTape):
         return SPLATTING.render_vjp(tape, v_image, v_alpha)
     payload, projected = tape.payload, tape.projected
@@ -207,13 +211,13 @@ def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats
     v_rgb = np.ascontiguousarray(v_channels[:, :3])
     v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_rgb)
     v_more = payload.footprints_vjp(projected, tuple(v_carried))
-    with np.errstate(over="ignore"):
-        transparencies = 1 / (1 + np.exp(payload.opacity_logits(g)))
+    logits, v_scales = payload.opacity_logits(g), v_flat.scales + v_more.scales
+    v_log_scales, v_logits = activate_vjp(primitives, logits, v_scales, v_flat.opacities)
     of_3dgs = {
         "means": v_flat.means + v_sh.means + v_more.means,
         "quats": v_flat.quats + v_more.quats,
-        "log_scales": primitives.scales * (v_flat.scales + v_more.scales),
-        "opacity_logits": primitives.opacities * transparencies * v_flat.opacities,
+        "log_scales": v_log_scales,
+        "opacity_logits": v_logits,
         "sh_dc": v_sh.sh_dc,
         "sh_rest": v_sh.sh_rest,
     }

@@ -21,12 +21,11 @@ from minisplat_ref.mechanisms.surfels.projection import (
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
-from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, choose_degree
+from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, choose_degree, parameters_vjp
 from minisplat_ref.types import (
     BlendGradient,
     Camera,
     Floats,
-    Gaussians,
     Ints,
     Model,
     Primitives,
@@ -176,10 +175,6 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Su
 def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
     """Gradient of :func:`render`, by the chain rule.
 
-    ::
-
-        v_log_s = s v_s,  v_logit = o (1 - o) v_o
-
     The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
     """
     g, shown, slices, camera = tape.gaussians, tape.shown, tape.slices, tape.camera
@@ -197,19 +192,8 @@ def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None)
     v_primitives = project_vjp(tape.primitives, camera, shown.conventions, shown.surfels, v_surfels)
     v_rgb = np.ascontiguousarray(v.colors[:, :3])
     v_sh = shown.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, shown.surfels.radii, v_rgb)
-    with np.errstate(over="ignore"):
-        transparencies = 1 / (1 + np.exp(g.opacity_logits))
-    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}
     return RenderGradient(
-        gaussians=g._replace(
-            means=v_primitives.means + v_sh.means,
-            quats=v_primitives.quats,
-            log_scales=tape.primitives.scales * v_primitives.scales,
-            opacity_logits=tape.primitives.opacities * transparencies * v_primitives.opacities,
-            sh_dc=v_sh.sh_dc,
-            sh_rest=v_sh.sh_rest,
-            **further,
-        ),
+        gaussians=parameters_vjp(g, tape.primitives, v_primitives, v_sh),
         background=v.background[:3],
         cam_from_world_R=v_primitives.cam_from_world_R + v_sh.cam_from_world_R,
         cam_from_world_t=v_primitives.cam_from_world_t + v_sh.cam_from_world_t,

@@ -19,11 +19,10 @@ from minisplat_ref.mechanisms.tangent.planes import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activate, choose_degree
+from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activate, choose_degree, parameters_vjp
 from minisplat_ref.types import (
     Camera,
     Floats,
-    Gaussians,
     Ints,
     Model,
     Primitives,
@@ -165,10 +164,6 @@ def render(model: Model, view: View, request: Request, *, buffer_size: int | Non
 def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
     """Gradient of :func:`render`, by the chain rule.
 
-    ::
-
-        v_log_s = s v_s,  v_logit = o (1 - o) v_o
-
     The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
     """
     p, bins, output = tape
@@ -187,19 +182,8 @@ def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> Re
     v_footprints = FootprintGradient(v_normals, v_conics, v_opacities, v_depths)
     v_primitives, v_means2d = project_vjp(p.primitives, camera, p.conventions, footprints, v_footprints)
     v_sh = p.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, p.sh_degree, footprints.radii, v_colors)
-    with np.errstate(over="ignore"):
-        transparencies = 1 / (1 + np.exp(g.opacity_logits))
-    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}
     return RenderGradient(
-        gaussians=g._replace(
-            means=v_primitives.means + v_sh.means,
-            quats=v_primitives.quats,
-            log_scales=p.primitives.scales * v_primitives.scales,
-            opacity_logits=p.primitives.opacities * transparencies * v_primitives.opacities,
-            sh_dc=v_sh.sh_dc,
-            sh_rest=v_sh.sh_rest,
-            **further,
-        ),
+        gaussians=parameters_vjp(g, p.primitives, v_primitives, v_sh),
         background=v_background,
         cam_from_world_R=v_primitives.cam_from_world_R + v_sh.cam_from_world_R,
         cam_from_world_t=v_primitives.cam_from_world_t + v_sh.cam_from_world_t,
