@@ -88,17 +88,44 @@ def list_tiles(surfels: Surfels, camera: Camera, conventions: Conventions, backe
     return backend.bin_gaussians(surfels.listed, grid, conventions)
 
 
-class SurfelTape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+class Seen(NamedTuple):
+    """A population as a camera sees it."""
 
     gaussians: Any
     primitives: Primitives
     camera: Camera
-    sh_degree: int | Ints  # active
+    surfels: Surfels
+
+
+class BlendTape(NamedTuple):
+    """What :func:`blend` keeps for :func:`blend_vjp`."""
+
     shown: Shown
     blended: RenderOutput
     measures: RayMeasures | None
     slices: dict[str, slice]
+
+
+class BlendedGradient(NamedTuple):
+    """Gradient of the loss with respect to the inputs of :func:`blend`."""
+
+    surfels: SurfelGradient
+    colors: Floats  # [N, 3]
+    carried: Floats  # [N, K]
+    background: Floats  # [3]
+
+
+class SurfelTape(NamedTuple):
+    """What :func:`render` keeps for :func:`render_vjp`."""
+
+    seen: Seen
+    sh_degree: int | Ints  # active
+    blend: BlendTape
+
+    @property
+    def shown(self) -> Shown:
+        """What was blended."""
+        return self.blend.shown
 
 
 def channels(wants: frozenset[str]) -> dict[str, slice]:
@@ -109,6 +136,94 @@ def channels(wants: frozenset[str]) -> dict[str, slice]:
             slices[name] = slice(first, first + size)
             first += size
     return slices
+
+
+def look(model: Model, view: View, request: Request) -> Seen:
+    """Return a population as the camera of a view sees it.
+
+    Raises
+    ------
+    InputError
+        Something is wanted that surfels do not have, or the conventions ask for compensated opacities.
+    """
+    known = CHANNELS.keys() | {"median_depth"} | (frozenset() if request.backend.is_compiled else STATISTICS)
+    if missing := request.wants - known:
+        way_out = "use --backend reference" if missing <= STATISTICS else "train a recipe that does without"
+        raise InputError(f"surfels are drawn without {', '.join(sorted(missing))}: {way_out}")
+    if request.conventions.is_antialiased:
+        raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
+    primitives = activate(model.gaussians, request.is_visible)
+    surfels = project(primitives, view.camera, request.conventions, PAPER)
+    return Seen(model.gaussians, primitives, view.camera, surfels)
+
+
+def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tuple[RenderOutput, BlendTape]:
+    """Blend the surfels of a view.
+
+    Parameters
+    ----------
+    seen : Seen
+        From :func:`look`.
+    colors : ndarray of shape (N, 3)
+        RGB.
+    carried : ndarray of shape (N, K)
+        What else each surfel brings along, such as its material.
+    request : Request
+        As for :func:`render`.
+
+    Returns
+    -------
+    output : RenderOutput
+        Its image has the channels of :func:`channels`, and then the K that are carried, over a background of 0.
+    tape : BlendTape
+    """
+    surfels, backend, dtype, slices = seen.surfels, request.backend, colors.dtype, channels(request.wants)
+    parts = {"rgb": colors}
+    for name in slices:
+        if name not in ("rgb", "median"):
+            parts[name] = surfels.normals if name == "normal" else np.zeros((len(surfels.depths), CHANNELS[name]))
+    all_colors = np.column_stack([*parts.values(), carried]).astype(dtype)
+    background = np.zeros(all_colors.shape[1], dtype)
+    if request.background is not None:
+        background[:3] = request.background
+    layout = Layout(*(slices[name].start if name in slices else None for name in ("depth", "spread")))
+    bins = list_tiles(surfels, seen.camera, request.conventions, backend)
+    shown = Shown(surfels, all_colors, background, bins, request.conventions, backend, layout)
+    blended = shown.blend(with_stats="stats" in request.wants)
+    measures = shown.measure_rays() if request.wants & {"median", "median_depth"} else None
+    image = blended.image
+    if measures is not None and "median" in slices:
+        at = slices["median"].start
+        image = np.concatenate([image[:, :, :at], measures.median[:, :, None].astype(dtype), image[:, :, at:]], axis=2)
+    output = blended._replace(
+        image=image,
+        median_depth=None if measures is None else measures.median.astype(dtype),
+        visible_ids=np.flatnonzero(surfels.radii[:, 0] > 0),
+        n_pairs=len(bins.gaussian_ids),
+    )
+    return output, BlendTape(shown, blended, measures, slices)
+
+
+def blend_vjp(tape: BlendTape, v_image: Floats, v_alpha: Floats | None) -> BlendedGradient:
+    """Gradient of :func:`blend`."""
+    shown, slices, v_median = tape.shown, tape.slices, None
+    v_alpha = np.zeros_like(tape.blended.alpha) if v_alpha is None else v_alpha
+    if "median" in slices:
+        v_median = np.ascontiguousarray(v_image[:, :, slices["median"].start])
+        v_image = np.delete(v_image, slices["median"].start, axis=2)
+    v = shown.blend_vjp(tape.blended, np.ascontiguousarray(v_image), v_alpha)
+    v_fields = v.primitives
+    if tape.measures is not None and v_median is not None:
+        v_rays = shown.measure_rays_vjp(tape.measures, v_median, np.zeros_like(v_median))
+        v_fields = tuple(a + b for a, b in zip(v_fields, v_rays, strict=True))
+    v_normals = v.colors[:, slices["normal"]] if "normal" in slices else np.zeros((len(v.colors), 3))
+    n_own = sum(part.stop - part.start for name, part in slices.items() if name != "median")
+    return BlendedGradient(
+        SurfelGradient(*v_fields, v_normals),
+        np.ascontiguousarray(v.colors[:, :3]),
+        v.colors[:, n_own:],
+        v.background[:3],
+    )
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, SurfelTape]:
@@ -134,42 +249,14 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Su
     Raises
     ------
     InputError
-        Something is wanted that surfels do not have, or the conventions ask for compensated opacities.
+        As :func:`look`.
     """
-    g, camera, conventions, backend = model.gaussians, view.camera, request.conventions, request.backend
-    missing = request.wants - CHANNELS.keys() - {"median_depth"} - (frozenset() if backend.is_compiled else STATISTICS)
-    if missing:
-        way_out = "use --backend reference" if missing <= STATISTICS else "train a recipe that does without"
-        raise InputError(f"surfels are drawn without {', '.join(sorted(missing))}: {way_out}")
-    if conventions.is_antialiased:
-        raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
-    dtype, slices = g.means.dtype, channels(request.wants)
+    seen, g = look(model, view, request), model.gaussians
     sh_degree = choose_degree(g.sh_rest, request.sh_degree)
-    primitives = activate(g, request.is_visible)
-    surfels = project(primitives, camera, conventions, PAPER)
-    parts = {"rgb": backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, surfels.radii)}
-    for name in slices:
-        if name not in ("rgb", "median"):
-            parts[name] = surfels.normals if name == "normal" else np.zeros((len(surfels.depths), CHANNELS[name]))
-    colors = np.column_stack(list(parts.values())).astype(dtype)
-    background = np.zeros(colors.shape[1], dtype)
-    if request.background is not None:
-        background[:3] = request.background
-    layout = Layout(*(slices[name].start if name in slices else None for name in ("depth", "spread")))
-    bins = list_tiles(surfels, camera, conventions, backend)
-    shown = Shown(surfels, colors, background, bins, conventions, backend, layout)
-    blended = shown.blend(with_stats="stats" in request.wants)
-    measures = shown.measure_rays() if request.wants & {"median", "median_depth"} else None
-    image = blended.image
-    if measures is not None and "median" in slices:
-        image = np.concatenate([image, measures.median[:, :, None].astype(dtype)], axis=2)
-    output = blended._replace(
-        image=image,
-        median_depth=None if measures is None else measures.median.astype(dtype),
-        visible_ids=np.flatnonzero(surfels.radii[:, 0] > 0),
-        n_pairs=len(bins.gaussian_ids),
-    )
-    return output, SurfelTape(g, primitives, camera, sh_degree, shown, blended, measures, slices)
+    radii = seen.surfels.radii
+    colors = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, seen.camera, sh_degree, radii)
+    output, tape = blend(seen, colors, np.zeros((len(colors), 0)), request)
+    return output, SurfelTape(seen, sh_degree, tape)
 
 
 def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
@@ -177,27 +264,16 @@ def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None)
 
     The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
     """
-    g, shown, slices, camera = tape.gaussians, tape.shown, tape.slices, tape.camera
-    n_blended = shown.colors.shape[1]
-    v_alpha = np.zeros_like(tape.blended.alpha) if v_alpha is None else v_alpha
-    v = shown.blend_vjp(tape.blended, np.ascontiguousarray(v_image[:, :, :n_blended]), v_alpha)
-    v_fields = v.primitives
-    if tape.measures is not None and "median" in slices:
-        v_median = np.ascontiguousarray(v_image[:, :, n_blended])
-        v_rays = shown.measure_rays_vjp(tape.measures, v_median, np.zeros_like(v_median))
-        v_fields = tuple(a + b for a, b in zip(v_fields, v_rays, strict=True))
-    v_normals = v.colors[:, slices["normal"]] if "normal" in slices else np.zeros_like(g.means)
-    v_T, v_c, v_o, v_z = v_fields
-    v_surfels = SurfelGradient(v_T, v_c, v_o, v_z, v_normals)
-    v_primitives = project_vjp(tape.primitives, camera, shown.conventions, shown.surfels, v_surfels)
-    v_rgb = np.ascontiguousarray(v.colors[:, :3])
-    v_sh = shown.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, shown.surfels.radii, v_rgb)
+    (g, primitives, camera, surfels), shown = tape.seen, tape.shown
+    v = blend_vjp(tape.blend, v_image, v_alpha)
+    v_primitives = project_vjp(primitives, camera, shown.conventions, surfels, v.surfels)
+    v_sh = shown.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, surfels.radii, v.colors)
     return RenderGradient(
-        gaussians=parameters_vjp(g, tape.primitives, v_primitives, v_sh),
-        background=v.background[:3],
+        gaussians=parameters_vjp(g, primitives, v_primitives, v_sh),
+        background=v.background,
         cam_from_world_R=v_primitives.cam_from_world_R + v_sh.cam_from_world_R,
         cam_from_world_t=v_primitives.cam_from_world_t + v_sh.cam_from_world_t,
-        means2d=centers_moved(v_surfels, shown.surfels).astype(g.means.dtype),
+        means2d=centers_moved(v.surfels, surfels).astype(g.means.dtype),
     )
 
 
