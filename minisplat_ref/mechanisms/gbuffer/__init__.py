@@ -1,0 +1,11 @@
+"""Shading once per pixel: materials blended by surfels, an environment, and what hides it.
+
+``environment``  light that comes from infinitely far away, one colour for each direction
+``prefilter``    the same light averaged over the lobe of a rough surface, and over the hemisphere of a matte one
+``brdf``         what share of it a surface reflects: the table of the split-sum approximation
+``shading``      the colour of a surface point from its material, its normal and the light
+``tone``         from light to sRGB
+``visibility``   how much of the surfels' own opacity lies in the way of a reflected ray
+
+Each function that training differentiates stands beside its gradient.
+"""
