@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gradcheck import check_jacobian
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.mechanisms.depth_maps.bilateral import BilateralWidths, joint_bilateral_depth
+from minisplat_ref.mechanisms.depth_maps.bilateral import (
+    BilateralWidths,
+    joint_bilateral_depth,
+    joint_bilateral_depth_vjp,
+)
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.depth_maps.reprojection import (
     DepthView,
@@ -69,6 +74,38 @@ def test_an_edge_of_the_photograph_keeps_the_depth_apart(rng):
     assert np.abs(kept - depth).max() < 0.02
     assert np.abs(kept - depth).std() < 0.5 * np.abs(noisy - depth).std()
     assert np.abs(blurred - depth).max() > 0.3
+
+
+def test_the_filter_visits_every_pair_of_the_window(rng):
+    """Against the sum as it is written, with a hole, and a window that is larger than the image in height."""
+    depth, image = rng.uniform(1, 2, (4, 9)), rng.uniform(size=(4, 9, 3))
+    depth[1, 2] = 0
+    widths = BilateralWidths(4, 2.0, 0.5)
+    ys, xs = np.indices(depth.shape)
+    for y, x in ((0, 0), (1, 3), (3, 8)):
+        is_near = (np.abs(ys - y) <= 4) & (np.abs(xs - x) <= 4) & (depth > 0)
+        exponents = ((ys - y) ** 2 + (xs - x) ** 2) / 8 + np.sum((image - image[y, x]) ** 2, axis=2) / 0.5
+        w = np.exp(-exponents) * is_near
+        found = joint_bilateral_depth(depth, image, widths)[y, x]
+        assert_allclose(found, np.sum(w * depth) / w.sum(), rtol=CLOSED_FORM)
+
+
+def test_the_gradient_of_the_filter(rng):
+    """It is linear where the holes stay, and the hole itself has no gradient."""
+    depth, image = rng.uniform(1, 2, (4, 5)), rng.uniform(size=(4, 5, 3))
+    depth[1, 2] = 0
+    widths, has_depth = BilateralWidths(2, 1.0, 0.5), depth > 0
+
+    def filtered(some):
+        whole = depth.copy()
+        whole[has_depth] = some
+        return (joint_bilateral_depth(whole, image, widths),)
+
+    def vjp(v):
+        return (joint_bilateral_depth_vjp(depth, image, v, widths)[has_depth],)
+
+    check_jacobian(filtered, vjp, (depth[has_depth],), names=("depth",))
+    assert joint_bilateral_depth_vjp(depth, image, np.ones((4, 5)), widths)[1, 2] == 0
 
 
 # --- reprojection ---

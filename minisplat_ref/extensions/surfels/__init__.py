@@ -28,8 +28,9 @@ counts; the code holds that constant. Distortion has the square of the code, not
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.surfels.method import DISCS, RECIPE
+from minisplat_ref.extensions.surfels.method import RECIPE
 from minisplat_ref.extensions.surfels.stages import stages
+from minisplat_ref.mechanisms.surfels.discs import DISCS
 from minisplat_ref.studies.study import OUT, declare, iterations, seeds, synthetic_scene
 
 LOSSES = declare(

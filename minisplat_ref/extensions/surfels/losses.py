@@ -14,10 +14,9 @@ renderer's channel ``spread``, the sum in L_d is ``b^2 (A S_2 - S_1^2)``, ``b = 
 
 import numpy as np
 
-from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.surfels.disagreement import disagree
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
-from minisplat_ref.types import Floats
 
 NEAR, FAR = 0.2, 100.0  # world units: between which depths are mapped to [0, 1], as released
 
@@ -37,34 +36,15 @@ def normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
     ``v_A = 1 / pixels``, ``v_n = -N / pixels``, and ``v_N = -n / pixels`` on through the normals to the depths.
     """
     sums, alpha = rendered.channel("depth")[..., 0], rendered.output.alpha
-    value, v_normal, v_depth = _disagree(rendered, expected_depth(sums, alpha))
-    v_sums, v_alpha = expected_depth_vjp(sums, alpha, v_depth)
-    return value, Cotangents({"normal": v_normal, "depth": v_sums[..., None]}, v_alpha + _v_opacity(alpha))
+    found = disagree(rendered, expected_depth(sums, alpha))
+    v_sums, v_alpha = expected_depth_vjp(sums, alpha, found.v_depth)
+    return found.value, Cotangents({"normal": found.v_normal, "depth": v_sums[..., None]}, v_alpha + found.v_alpha)
 
 
 def median_normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
     """Return L_n with the surface through the median depths, which the paper prefers for bounded scenes."""
-    value, v_normal, v_depth = _disagree(rendered, rendered.channel("median")[..., 0])
-    v_alpha = _v_opacity(rendered.output.alpha)
-    return value, Cotangents({"normal": v_normal, "median": v_depth[..., None]}, v_alpha)
-
-
-def _disagree(rendered: Rendered, depth: Floats) -> tuple[float, Floats, Floats]:
-    """Return L_n, and its derivatives with respect to the blended normals and the depth.
-
-    There is no N beside a pixel without hits, which has no depth.
-    """
-    A, camera = rendered.output.alpha, rendered.view.camera
-    is_hit, has_normal = A > rendered.request.conventions.alpha_min / 2, np.zeros(A.shape, bool)
-    has_normal[1:-1, 1:-1] = is_hit[2:, 1:-1] & is_hit[:-2, 1:-1] & is_hit[1:-1, 2:] & is_hit[1:-1, :-2]
-    n = np.where(has_normal[..., None], rendered.channel("normal"), 0)
-    N, share = central_normals(depth, camera), A.dtype.type(1 / A.size)
-    value = float(share * np.sum(A - np.sum(n * N, axis=2), dtype=np.float64))
-    return value, -share * np.where(has_normal[..., None], N, 0), central_normals_vjp(depth, camera, -share * n)
-
-
-def _v_opacity(alpha: Floats) -> Floats:
-    return np.full_like(alpha, 1 / alpha.size)
+    found = disagree(rendered, rendered.channel("median")[..., 0])
+    return found.value, Cotangents({"normal": found.v_normal, "median": found.v_depth[..., None]}, found.v_alpha)
 
 
 # Weights and dates of the released code: of 30,000 iterations. The distortion's weight is 0 there by default, 10 to 100

@@ -3,8 +3,8 @@
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.surfels.method import DISCS
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.surfels.discs import DISCS
 from minisplat_ref.mechanisms.surfels.stages import rays_stage, renderer_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting

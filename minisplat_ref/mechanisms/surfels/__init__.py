@@ -4,5 +4,6 @@
 NumPy; :mod:`.kernels` states the hit once more, for the plain kernels. What depends on the order of the hits, the
 median depth and the distortion as gsplat measures it, is in :mod:`.ray_measures` and, for kernels, in
 :mod:`.ray_kernels`. :mod:`.blending` chooses between the two, and :mod:`.renderer` is the pair that training calls.
-Normals and depths are channels of the image like colours, so their gradients need no further code.
+Normals and depths are channels of the image like colours, so their gradients need no further code. :mod:`.discs` and
+:mod:`.disagreement` are what recipes of surfels share: start, density control, and the loss on normals.
 """
