@@ -45,7 +45,8 @@ examples:
 """
 RUN_CAMERAS = ("test", "train", "all")
 LIST = "pictures.json"  # what a rendering has left in its folder, so that the next one can take it away
-ENDS = (".png", "_depth.png", "_depth.npy")
+ENDS = (".png", "_depth.png", "_depth.npy", "_albedo.png", "_metallic.png", "_roughness.png", "_normal.png")
+MAPS = ("albedo", "metallic", "roughness", "normal")
 ORBIT_SIZE = (640, 480)  # pixels, where no run says otherwise
 
 
@@ -62,6 +63,15 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
+    parser.add_argument(
+        "--map", choices=MAPS, help="also NAME_MAP.png of what has a material, or normals (camera frame, (n + 1) / 2)"
+    )
+    parser.add_argument(
+        "--environment",
+        type=Path,
+        metavar="FILE",
+        help="other light: an image or .npy in latitude and longitude",
+    )
     parser.add_argument(
         "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
     )
@@ -94,6 +104,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io import write_image
     from minisplat_ref.io.film import check_film, write_film
     from minisplat_ref.io.names import file_names
+    from minisplat_ref.mechanisms.gbuffer.maps import map_image
     from minisplat_ref.reference.depth import expected_depth
     from minisplat_ref.reports.images import depth_image, depth_range
     from minisplat_ref.runs.first_use import warn_if_not_kept
@@ -110,7 +121,8 @@ def run(args: argparse.Namespace) -> int:
     if args.film is not None:
         check_film(args.film, [(view.camera.width, view.camera.height) for view in views])
     names = file_names([view.name for view in views])
-    wants = frozenset({"depth"} if args.depth else ())
+    channels = _channels(args, source)
+    wants = frozenset(channels) - {"rgb"}
     outputs = (source.trained.render(view_from(view.camera, time=view.time), wants) for view in views)
     first = next(outputs)  # what cannot be drawn is refused before the folder is touched
     _make_room(out, names)
@@ -118,14 +130,34 @@ def run(args: argparse.Namespace) -> int:
     for name, output in zip(names, drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
-            depth = source.frame.unit * expected_depth(output.image[..., 3], output.alpha)  # [H, W] as in the files
+            depth = source.frame.unit * expected_depth(
+                output.image[..., channels["depth"]][..., 0], output.alpha
+            )  # [H, W] as in the files
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_image(depth, *depth_range(depth)))
+        if args.map:
+            write_image(
+                out / f"{name}_{args.map}.png", map_image(args.map, output.image[..., channels[args.map]], output.alpha)
+            )
     print(f"{len(views)} images in {out}")
     if args.film is not None:
         write_film(args.film, [out / f"{name}.png" for name in names], args.fps)
         print(f"film: {args.film}")
     return 0
+
+
+def _channels(args: argparse.Namespace, source: "_Source") -> dict[str, slice]:
+    """Return the channels that are drawn, by name.
+
+    Raises
+    ------
+    InputError
+        The renderer has no map of that name.
+    """
+    renderer, wants = source.trained.renderer, {"depth"} if args.depth else set()
+    if args.map and args.map not in renderer.channels(frozenset({args.map})):
+        raise InputError(f"{args.input} has no map {args.map}: it is drawn as {renderer.name}; leave --map out")
+    return renderer.channels(frozenset(wants | {args.map} if args.map else wants))
 
 
 def _make_room(out: Path, names: Sequence[str]) -> None:
@@ -172,6 +204,10 @@ def _open(args: argparse.Namespace) -> _Source:
     source = _open_run(path, args) if path.is_dir() else _open_file(path, args)
     given = {name: getattr(args, name) for name in ("background", "profile", "backend")}
     given = {name: value for name, value in given.items() if value is not None}
+    if args.environment is not None:
+        from minisplat_ref.mechanisms.gbuffer.lighting import relight
+
+        given["model"] = relight(source.trained.model, args.environment)
     return source._replace(trained=source.trained._replace(**given))
 
 

@@ -2,8 +2,8 @@
 
 The Gaussians of the tiny scene become the representation's population. Its further fields, and shared parameters, have
 the initial values of training, often zero or the identity, where much of a gradient vanishes: here random noise is
-added. A field of learning rate 0, which an event sets instead of a gradient, gets noise too but is not differentiated:
-a bound or a number of samples has no derivative. The view is at time 0.7, so that time has an effect.
+added. A parameter of learning rate 0, which an event sets instead of a gradient, gets noise too but is not
+differentiated: a bound or a number of samples has no derivative. The view is at time 0.7, so that time has an effect.
 
 The calls of the backend's stages record which hits are blended and which of them are clamped. They do not see a
 threshold of the renderer's own, a gate or a ReLU: its stage belongs in the extension's ``stages``. A stage there with
@@ -84,7 +84,7 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
     """Return a renderer as a function of every field, every shared parameter, the background and the pose.
 
     The background is left out where the image does not depend on it, as behind a sky of the renderer's own, and so are
-    fields of learning rate 0.
+    parameters of learning rate 0.
 
     Parameters
     ----------
@@ -101,9 +101,11 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
     (population, shared), _ = noisy_model(setting, view, representation, rng)
     fields = population._asdict()
     wants = frozenset({"depth"} & renderer.channels(frozenset({"depth"})).keys())
-    held = {name: fields[name] for name, rate in representation.rates.of.items() if rate == 0 and name in fields}
-    free = {name: field for name, field in fields.items() if name not in held}
-    inputs = {**free, **shared, "background": setting.background, **setting.pose}
+    all_parameters = {**fields, **shared}
+    still = {name for name, rate in representation.rates.of.items() if rate == 0}
+    held = {name: array for name, array in all_parameters.items() if name in still}
+    free = {name: array for name, array in all_parameters.items() if name not in still}
+    inputs = {**free, "background": setting.background, **setting.pose}
 
     def draw(arrays: dict[str, Floats], used: Backend) -> tuple[RenderOutput, Any]:
         model = Model(population._make(arrays[name] for name in fields), {name: arrays[name] for name in shared})

@@ -14,8 +14,7 @@ renderer's channel ``spread``, the sum in L_d is ``b^2 (A S_2 - S_1^2)``, ``b = 
 
 import numpy as np
 
-from minisplat_ref.mechanisms.surfels.disagreement import disagree
-from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
+from minisplat_ref.mechanisms.surfels.disagreement import disagree, normal_consistency
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 
 NEAR, FAR = 0.2, 100.0  # world units: between which depths are mapped to [0, 1], as released
@@ -28,17 +27,6 @@ def distortion(rendered: Rendered) -> tuple[float, Cotangents]:
     scale = A.dtype.type((FAR * NEAR / (FAR - NEAR)) ** 2 / A.size)
     value = float(scale * np.sum(A * S_2 - S_1 * S_1, dtype=np.float64))
     return value, Cotangents({"spread": scale * np.stack([-2 * S_1, A], axis=2)}, scale * S_2)
-
-
-def normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
-    """Return L_n with the surface through the expected depths.
-
-    ``v_A = 1 / pixels``, ``v_n = -N / pixels``, and ``v_N = -n / pixels`` on through the normals to the depths.
-    """
-    sums, alpha = rendered.channel("depth")[..., 0], rendered.output.alpha
-    found = disagree(rendered, expected_depth(sums, alpha))
-    v_sums, v_alpha = expected_depth_vjp(sums, alpha, found.v_depth)
-    return found.value, Cotangents({"normal": found.v_normal, "depth": v_sums[..., None]}, v_alpha + found.v_alpha)
 
 
 def median_normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:

@@ -5,6 +5,8 @@
 ``brdf``         what share of it a surface reflects: the table of the split-sum approximation
 ``shading``      the colour of a surface point from its material, its normal and the light
 ``tone``         from light to sRGB
+``lighting``     the environment that a model has, and another from a file
+``maps``         materials and normals as pictures
 ``visibility``   how much of the surfels' own opacity lies in the way of a reflected ray
 
 Each function that training differentiates stands beside its gradient.

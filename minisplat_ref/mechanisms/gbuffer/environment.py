@@ -83,7 +83,9 @@ def read_vjp(image: Floats, places: Places, v_colors: Floats) -> tuple[Floats, F
     shares = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
     weighted = np.stack([share * v_colors for share in shares]).reshape(-1, 3)
     n_texels, texels = image.shape[0] * image.shape[1], places.texels.ravel()
-    v_image = np.stack([np.bincount(texels, weighted[:, k], n_texels) for k in range(3)], axis=1)
+    v_image = np.empty((n_texels, 3))
+    for k in range(3):
+        v_image[:, k] = np.bincount(texels, weighted[:, k], n_texels)
     along_row = (1 - a) * (lower_left - upper_left) + a * (lower_right - upper_right)
     along_column = (1 - b) * (upper_right - upper_left) + b * (lower_right - lower_left)
     v_row = np.sum(v_colors * along_row, axis=1, keepdims=True)

@@ -23,9 +23,10 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.gbuffer.environment import locate, read, read_vjp, texel_directions
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Floats, Ints
 
 KNOTS = (0.0, 0.3, 0.5, 0.7, 1.0)
+STEPS: Floats = np.array(KNOTS[1:]) - np.array(KNOTS[:-1])
 COARSER = (1, 1, 2, 4, 4)  # by how much the map of a knot has fewer rows and columns
 SPLIT = 3
 ROWS_MAX = 32  # of an environment whose averages are computed texel by texel
@@ -61,12 +62,12 @@ def _lobe(height: int, width: int, roughness: float, coarser: int) -> Floats:
 def _matrices(height: int, width: int) -> tuple[tuple[Floats, ...], Floats]:
     """Return the matrices [h w, H W] of the knots but the first, and that of the irradiance [9, H W]."""
     n = height * width
-    maps = [
+    maps: list[Floats] = [
         _lobe(height, width, roughness, coarser).reshape(n // coarser**2, n)
         for roughness, coarser in zip(KNOTS[1:], COARSER[1:], strict=True)
     ]
     directions, solid = texel_directions(height, width)
-    moments = COSINE[:, None] * sh_basis(directions.reshape(-1, 3), 2).T * solid.ravel()
+    moments: Floats = COSINE[:, None] * sh_basis(directions.reshape(-1, 3), 2).T * solid.ravel()
     moments[1:] -= moments[1:].sum(axis=1, keepdims=True) * solid.ravel() / (4 * np.pi)  # of a constant, exactly 0
     return tuple(maps), moments
 
@@ -82,8 +83,8 @@ def check_size(height: int, width: int) -> None:
     step = COARSER[-1] if height <= ROWS_MAX else ROWS_MAX
     if height < step or height % step or width != 2 * height:
         raise InputError(
-            f"an environment of {width} x {height} texels: its height must be a multiple of {step} and its width twice"
-            " that"
+            f"an environment of {width} x {height} texels: its height must be a multiple of {step}, its width twice the"
+            " height"
         )
 
 
@@ -124,10 +125,10 @@ def prefilter_vjp(image: Floats, v: Filtered) -> Floats:
     return v.maps[0] + np.repeat(np.repeat(shared, finer, axis=0), finer, axis=1)
 
 
-def _between(roughness: Floats) -> tuple[Floats, Floats]:
+def _between(roughness: Floats) -> tuple[Ints, Floats]:
     """Return the index [P] of the knot below, and the share [P] of the knot above."""
     below = np.clip(np.searchsorted(KNOTS, roughness, side="right") - 1, 0, len(KNOTS) - 2)
-    low, step = np.array(KNOTS)[below], np.diff(KNOTS)[below]
+    low, step = np.array(KNOTS)[below], STEPS[below]
     return below, (roughness - low) / step
 
 
@@ -163,7 +164,8 @@ def reflected_vjp(
         v_directions[rows] += v_places
         products = np.sum(v_colors[rows] * read(image, places), axis=1)
         v_share[rows] += np.where(is_upper[rows], products, -products)
-    return tuple(v_maps), v_directions, (v_share / np.diff(KNOTS)[below]).astype(roughness.dtype)
+    v_roughness: Floats = (v_share / STEPS[below]).astype(roughness.dtype)
+    return tuple(v_maps), v_directions, v_roughness
 
 
 def matte(light: Filtered, normals: Floats) -> Floats:

@@ -20,3 +20,8 @@ def tone_vjp(linear: Floats, v_encoded: Floats) -> Floats:
     """Gradient of :func:`tone`: ``12.92 v`` up to the knee, and ``1.055 / 2.4 x^(1 / 2.4 - 1) v`` beyond."""
     slope = np.where(linear <= KNEE, 12.92, 1.055 / 2.4 * np.maximum(linear, KNEE) ** (1 / 2.4 - 1))
     return (slope * v_encoded).astype(linear.dtype)
+
+
+def untone(encoded: Floats) -> Floats:
+    """Return linear values of sRGB ones in [0, 1]: the inverse of :func:`tone`."""
+    return np.where(encoded <= 12.92 * KNEE, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
-from minisplat_ref.training.losses import Rendered
+from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
+from minisplat_ref.training.losses import Cotangents, Rendered
 from minisplat_ref.types import Floats
 
 
@@ -42,3 +43,14 @@ def disagree(rendered: Rendered, depth: Floats) -> Disagreement:
     value = float(share * np.sum(A - np.sum(n * N, axis=2), dtype=np.float64))
     v_normal = -share * np.where(has_normal[..., None], N, 0)
     return Disagreement(value, v_normal, central_normals_vjp(depth, camera, -share * n), np.full_like(A, share))
+
+
+def normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return L with the surface through the expected depths.
+
+    ``v_A = 1 / pixels``, ``v_n = -N / pixels``, and ``v_N = -n / pixels`` on through the normals to the depths.
+    """
+    sums, alpha = rendered.channel("depth")[..., 0], rendered.output.alpha
+    found = disagree(rendered, expected_depth(sums, alpha))
+    v_sums, v_alpha = expected_depth_vjp(sums, alpha, found.v_depth)
+    return found.value, Cotangents({"normal": found.v_normal, "depth": v_sums[..., None]}, v_alpha + found.v_alpha)

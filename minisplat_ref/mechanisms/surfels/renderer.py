@@ -219,7 +219,7 @@ def blend_vjp(tape: BlendTape, v_image: Floats, v_alpha: Floats | None) -> Blend
     v_normals = v.colors[:, slices["normal"]] if "normal" in slices else np.zeros((len(v.colors), 3))
     n_own = sum(part.stop - part.start for name, part in slices.items() if name != "median")
     return BlendedGradient(
-        SurfelGradient(*v_fields, v_normals),
+        SurfelGradient(v_fields[0], v_fields[1], v_fields[2], v_fields[3], v_normals),
         np.ascontiguousarray(v.colors[:, :3]),
         v.colors[:, n_own:],
         v.background[:3],
