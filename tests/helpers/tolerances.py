@@ -209,6 +209,13 @@ SURFEL_POINT = 1e-7
 # A disc of a thousand units stands for a plane, and its Gaussian falls by this within the image.
 SURFEL_WIDE = 1e-4
 
+# A light of curvature 1 within a texel, times the square of its height in radians: an eighth between two centres, and
+# as much again beyond the outermost one.
+ENVIRONMENT_TEXEL = 0.25
+
+# The mean of 1,024 evenly spread samples of a smooth function: a few over their number.
+SPLIT_SUM = 5e-3
+
 # Gradients of surfels in float32, beside the 2e-5 of others: grazing hits divide by the angle, inverse depths by z^2.
 SURFEL_FLOAT32_GRADIENT = 5e-4
 

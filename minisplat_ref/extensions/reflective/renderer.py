@@ -9,10 +9,12 @@ with the accumulated opacity A. With occlusion, ``1 - V`` is the opacity of the 
 the expected depth of the pixel on (:mod:`minisplat_ref.mechanisms.gbuffer.visibility`).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.reflective.around import (
     Sight,
     light_around,
@@ -88,7 +90,7 @@ def materials(g: ReflectiveSurfels) -> Floats:
 
 
 def render(
-    model: Model, view: View, request: Request, visibility: Floats | None = None
+    model: Model, view: View, request: Request, visibility: Floats | None = None, *, mirrors: bool
 ) -> tuple[RenderOutput, ReflectiveTape]:
     """Render a view of reflective surfels; see :func:`minisplat_ref.mechanisms.surfels.renderer.render`.
 
@@ -100,7 +102,16 @@ def render(
         As there; the maps of ``MAPS`` can be wanted, too.
     visibility : ndarray of shape (H, W), optional
         How much of the environment each pixel's reflected ray sees; traced by default.
+    mirrors : bool
+        Whether surfels reflect light besides scattering it.
+
+    Raises
+    ------
+    InputError
+        The model has no environment.
     """
+    if ENVIRONMENT not in model.shared:
+        raise InputError("a file of reflective surfels has no place for their light: render the run's folder instead")
     g, dtype = model.gaussians, model.gaussians.means.dtype
     stage = round(float(model.shared[STAGE][0]))
     maps = request.wants & MAPS.keys()
@@ -115,7 +126,7 @@ def render(
     slices = discs.channels(own.wants)
     if stage < PER_PIXEL:
         surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
-        linear, shading = shade(surface, light)
+        linear, shading = shade(surface, light, mirrors=mirrors)
         colors[rows] = tone(linear)
         output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
         image, pixels = output.image, None
@@ -133,7 +144,7 @@ def render(
             else:
                 sees = visibility.ravel()[pixels.rows]
             around = Around(sees, np.ascontiguousarray(X[:, :3]))
-        linear, shading = shade(surface, light, around)
+        linear, shading = shade(surface, light, around, mirrors)
         background = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
         image = output.image.copy()
         image[:, :, :3] = background
@@ -300,4 +311,4 @@ def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
     return v
 
 
-REFLECTIVE = Renderer("reflective surfels", render, render_vjp, channels)
+REFLECTIVE = Renderer("reflective surfels", partial(render, mirrors=True), render_vjp, channels)

@@ -48,7 +48,7 @@ def _stage(backend: Backend, setting: Setting, rng: np.random.Generator, stage: 
     sides: list[np.ndarray] = []
 
     def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, object]:
-        output, tape = render(model, view, request, visibility)
+        output, tape = render(model, view, request, visibility, mirrors=True)
         sides[:] = [*sides_of(tape.blend.shown), *sides_of_shading(tape.shading, tape.linear)]
         light = light_around(tape.sight, coefficients(model.gaussians, tape.rows), tape.degree)
         sides.append(light > 0)

@@ -12,7 +12,7 @@ def map_image(name: str, sums: Floats, alpha: Floats) -> np.ndarray:
     Normals, which are of unit length again, are shown as (n + 1) / 2, albedo as sRGB, and the others as they are.
     """
     is_hit = alpha[..., None] > 0
-    means = sums / np.where(is_hit, alpha[..., None], 1)
+    means: Floats = sums / np.where(is_hit, alpha[..., None], 1)
     if name == "normal":
         length = np.linalg.norm(means, axis=2, keepdims=True)
         means = (means / np.where(length > 0, length, 1) + 1) / 2

@@ -73,7 +73,9 @@ class ShadingGradient(NamedTuple):
     around: Floats | None  # [P, 3]
 
 
-def shade(surface: Surface, light: Filtered, around: Around | None = None) -> tuple[Floats, ShadingTape]:
+def shade(
+    surface: Surface, light: Filtered, around: Around | None = None, mirrors: bool = True
+) -> tuple[Floats, ShadingTape]:
     """Return the colours [P, 3] of surface points, linear RGB, and the tape.
 
     Parameters
@@ -84,11 +86,15 @@ def shade(surface: Surface, light: Filtered, around: Around | None = None) -> tu
         The environment.
     around : Around, optional
         What hides it; nothing by default.
+    mirrors : bool
+        Whether anything is reflected; without, S and B are 0, and the surface is matte.
     """
     a, m, roughness, n, v = surface
     cosines = np.sum(n * v, axis=1)
     r = 2 * cosines[:, None] * n - v
     shares = reflectance(cosines, roughness)
+    if not mirrors:
+        shares = (np.zeros_like(shares[0]),) * 3
     S, B = shares[0][:, :1], shares[0][:, 1:]
     E, L_env = matte(light, n), reflected(light, r, roughness)
     L = L_env
