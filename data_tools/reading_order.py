@@ -137,6 +137,11 @@ ORDER = (
                 (21,),
                 "discs with depths and normals; from depth maps to a mesh",
             ),
+            Step(
+                ("mechanisms/gbuffer/", "extensions/reflective/"),
+                (),
+                "materials blended and shaded once per pixel, in an environment that is learned",
+            ),
         ),
     ),
     Part(

@@ -352,6 +352,27 @@ TABLES = {
     "pixel-order": GS_ACCEL | rows(f"{OURS}: exact by default", render__buffer_size=None),
     "polygons": GS_ACCEL,
     "rays": GS_ACCEL,
+    "reflective": {name: row for name, row in GS_ACCEL.items() if name != "prune_faint.min_opacity"}
+    | rows(
+        "Ref-Gaussian, section 4 and released code; 2DGS",
+        normal_consistency=(0.05, 7_001),
+        prune_faint__min_opacity=0.05,
+        spread_normals__growth=1.5,
+    )
+    | rows("Ref-Gaussian, the stages of training", shade_by=[[18_000], [20_000]], shade_by__stage=[1, 2])
+    | rows(
+        f"{OURS}: rates, what counts as a mirror, how much others are disturbed, and no disturbance up to 2,000",
+        rate__albedo_logits=0.01,
+        rate__metallic_logits=0.01,
+        rate__roughness_logits=0.01,
+        rate__log_environment=0.01,
+        rate__shading_stage=0.0,
+        render__mirrors=True,
+        spread_normals=[steps(3_000, 17_000, 1_000)],
+        spread_normals__turn=0.02,
+        spread_normals__metallic=0.5,
+        spread_normals__roughness=0.3,
+    ),
     "surfels": {name: row for name, row in GS_ACCEL.items() if name != "prune_faint.min_opacity"}
     | rows(
         "2DGS, section 6.1 and released code",
@@ -380,6 +401,7 @@ CONSTANTS = [
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
+    ("reflective.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
     ("surfels.losses", "NEAR", 0.2, "2DGS, released code"),
     ("surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
