@@ -9,7 +9,7 @@ from minisplat_ref.extensions.mvg.insertion import Insertions, Photographed, Rul
 from minisplat_ref.extensions.mvg.losses import depth_steps, filtered_normals
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances
 from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS, LOG_THICKNESS
-from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.rendering import RenderSettings
@@ -23,6 +23,7 @@ from minisplat_ref.types import Floats, Gaussians, Model, View
 
 ALPHA_MIN = 0.5  # of a pixel that shows a surface
 DEPTH = frozenset({"depth"})
+INSERT_LEAST_GAP = 20  # iterations: the surfels of the last insertion have to become opaque to show a depth
 
 
 def insert_consistent(
@@ -99,7 +100,7 @@ MVG = GS_ACCEL._replace(
             2_500,
             partial(insert_consistent, n_views=2, n_sources=4, near_stride=4, far_stride=2),
             stop=12_000,
-            min_gap=DENSIFY_LEAST_GAP,
+            min_gap=INSERT_LEAST_GAP,
         ),
     ),
 )
