@@ -8,7 +8,7 @@ once.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -94,7 +94,8 @@ def propose(views: Sequence[Photographed], rules: Rules, rng: np.random.Generato
         _of_view(view._replace(seen=view.seen._replace(depth=depth)), view.seen.depth, cuts, rules.strides, i, rng)
         for i, (view, depth) in enumerate(zip(views, fused, strict=True))
     ]
-    return Insertions(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+    joined: list[Any] = [np.concatenate(fields) for fields in zip(*parts, strict=True)]
+    return Insertions(*joined)
 
 
 def _of_view(
@@ -146,4 +147,4 @@ def uncovered(found: Insertions, older: Floats) -> Insertions:
     stays = np.zeros(len(rows), bool)
     for i, others in enumerate(near):
         stays[i] = not any(stays[j] for j in others if j < i)
-    return Insertions(*(field[rows[stays]] for field in found))
+    return found._make(field[rows[stays]] for field in found)
