@@ -17,6 +17,7 @@ from minisplat_ref.extensions.mvg.reference import depth_cuts, levels_of, on_gri
 from minisplat_ref.mechanisms.depth_maps.bilateral import BilateralWidths, joint_bilateral_depth
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances, agree, nearest_views, unproject
+from minisplat_ref.strategy.ops import take
 from minisplat_ref.types import Bools, Floats, Ints
 
 WIDTHS = BilateralWidths(radius=2, spatial=1.0, color=0.1)
@@ -147,4 +148,4 @@ def uncovered(found: Insertions, older: Floats) -> Insertions:
     stays = np.zeros(len(rows), bool)
     for i, others in enumerate(near):
         stays[i] = not any(stays[j] for j in others if j < i)
-    return found._make(field[rows[stays]] for field in found)
+    return take(found, rows[stays])
