@@ -133,7 +133,13 @@ ORDER = (
                 "textures and sharp edges; lines, polygons, meshes",
             ),
             Step(
-                ("mechanisms/surfels/", "extensions/surfels/", "extensions/gdgs/", "mechanisms/fusion/"),
+                (
+                    "mechanisms/surfels/",
+                    "extensions/surfels/",
+                    "extensions/mvg/",
+                    "extensions/gdgs/",
+                    "mechanisms/fusion/",
+                ),
                 (21,),
                 "discs with depths and normals; from depth maps to a mesh",
             ),

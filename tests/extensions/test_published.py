@@ -281,6 +281,22 @@ GDGS = {
     ),
 }
 
+MVG = {
+    **{name: row for name, row in GS_ACCEL.items() if name != "prune_faint.min_opacity"},
+    **rows("2DGS, released code", prune_faint__min_opacity=0.05, filtered_normals=(0.05, 7_001)),
+    **rows("MVSNet's fusion, a pixel and 1 % in at least two views", insert_consistent__n_views=2),
+    **rows(
+        f"{OURS}: no value of the paper was found",
+        depth_steps=(0.1, 7_001),
+        depth_steps__sharpness=10.0,
+        insert_consistent=[steps(2_500, 10_000, 2_500)],
+        insert_consistent__n_sources=4,
+        insert_consistent__near_stride=4,
+        insert_consistent__far_stride=2,
+        insert_consistent__min_gap=20,
+    ),
+}
+
 TABLES = {
     "3dgs": GS,
     "3dgs-accel": GS_ACCEL,
@@ -308,6 +324,7 @@ TABLES = {
     "fans": FANS,
     "gdgs": GDGS,
     "micro": MICRO,
+    "mvg": MVG,
     "mixed": GS_ACCEL
     | rows(
         "MP-GS, settings of the training",
