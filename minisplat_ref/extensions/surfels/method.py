@@ -2,25 +2,14 @@
 
 from functools import partial
 
-import numpy as np
-
 from minisplat_ref.extensions.surfels.losses import LOSSES
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
+from minisplat_ref.mechanisms.surfels.start import as_surfels
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, prune_faint
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import Event, Every, does
-from minisplat_ref.types import Gaussians
 
-LOG_THICKNESS = -16.0  # 1e-7 world units: what other programs draw, and where children of a split are placed
 OPACITY_MIN = 0.05  # released; 3DGS has 0.005
-
-
-def as_surfels(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    """Return flat Gaussians that face at random, as the released code starts: those of 3DGS all face world z."""
-    quats = rng.uniform(size=gaussians.quats.shape).astype(gaussians.quats.dtype)
-    log_scales = gaussians.log_scales.copy()
-    log_scales[:, 2] = LOG_THICKNESS
-    return gaussians._replace(quats=quats, log_scales=log_scales)
 
 
 DISCS = Representation("surfels", extend=as_surfels, renderer=SURFELS)
