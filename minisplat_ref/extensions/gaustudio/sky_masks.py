@@ -1,7 +1,7 @@
 """The stage ``sky_mask``: which pixels of a photograph show the sky.
 
 GauStudio takes masks from a network. Here they are an input, or what the colours say: from the upper edge of the
-photograph down, pixels that are bright and at least as blue as they are red and green.
+photograph down, pixels that are bright and more blue than red, or white. That takes for sky whatever looks like it.
 """
 
 from functools import lru_cache
@@ -15,14 +15,16 @@ from minisplat_ref.io.images import read_mask, resize_mask
 from minisplat_ref.types import Bools, View
 
 BRIGHT = 110  # of 255, in blue
+BLUER = 1.1  # times the red: in the shade roads are bluish, too. Chosen on photographs with a sky and without
 WHITE = 225  # of 255, in the darkest channel: a cloud, whatever its tint
 ASPECT = 0.02  # relative difference of the ratios of sides beyond which a mask is not of this photograph
 
 
 def by_color(view: View, mask_folder: str) -> Bools:
     """What is bright and blue, or white, and reaches the upper edge."""
-    red, green, blue = view.image.astype(np.int16).transpose(2, 0, 1)
-    is_like_sky = (blue >= BRIGHT) & (blue >= red) & (blue >= green) | (view.image.min(axis=2) >= WHITE)
+    red, green, blue = view.image.astype(np.float32).transpose(2, 0, 1)
+    is_blue = (blue >= BRIGHT) & (blue >= BLUER * red) & (blue >= green)
+    is_like_sky = is_blue | (view.image.min(axis=2) >= WHITE)
     regions, _ = label(is_like_sky)
     at_top = np.unique(regions[0])
     return np.isin(regions, at_top[at_top > 0])
