@@ -69,7 +69,7 @@ def nothing() -> Background:
 
 
 def harmonics() -> Background:
-    """Spherical harmonics of degree 3, as --set sky=true has them in other recipes."""
+    """Spherical harmonics of degree 3, the sky of other recipes."""
     return Background(lambda: clear_sky(0), with_sky)
 
 

@@ -32,7 +32,7 @@ def stereo(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaus
 
 
 def box(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussians | None:
-    """As many, at random in the box of the points, and grey: without structure from motion."""
+    """As many, grey, at random in the box of the points."""
     if n_rows(gaussians) <= N_AXES:
         return None
     low, high = np.quantile(gaussians.means.astype(np.float64), [BOX_SHARE, 1 - BOX_SHARE], axis=0)
