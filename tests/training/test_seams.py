@@ -352,15 +352,15 @@ def test_unknown_setting_lists_those_that_exist():
 
 
 def coloured(scene, rng, *, color, folder):
-    return {"table": np.full(3, color())}
+    return {"table": color(3)}
 
 
-def grey():
-    return 0.5
+def grey(n_channels):
+    return np.full(n_channels, 0.5)
 
 
-def white():
-    return 1.0
+def white(n_channels):
+    return np.full(n_channels, 1.0)
 
 
 def test_settings_of_shared_parameters_are_functions_and_text():

@@ -1,4 +1,4 @@
-"""GauStudio: stages that are exchanged by name, with a background for what is infinitely far.
+"""GauStudio: stages that are exchanged by name, and a background for what is far away.
 
 This follows GauStudio, Ye et al. 2024, arXiv 2403.19632, and its code: a training is a chain of modules, each of which
 has alternatives. A module here is a function, a stage a setting of the recipe that names one of the functions in its

@@ -13,7 +13,8 @@ from minisplat_ref.io.atomic import making_folder
 EPILOG = """\
 example:
   minisplat-ref gaustudio masks SCENE --out masks
-  minisplat-ref train SCENE --recipe gaustudio --set sky_mask=from_files --set mask_folder=masks"""
+  minisplat-ref train SCENE --recipe gaustudio \\
+    --set sky_mask=from_files --set mask_folder=masks"""
 
 
 def add_parser(commands: Any) -> None:

@@ -70,7 +70,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "modules",
         help="list the stages, and what each can be exchanged for",
-        description="List the stages of the recipe gaustudio and the modules of each; * marks the one it has.",
+        description="List the stages of the recipe gaustudio and the modules of each.\n* marks the one it has.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

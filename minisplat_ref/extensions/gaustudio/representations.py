@@ -27,4 +27,10 @@ def gaussians() -> Primitive:
 
 def surfels() -> Primitive:
     """Gaussians on discs, those of 2DGS."""
-    return Primitive(SURFELS, as_surfels)
+    return Primitive(SURFELS, _as_discs)
+
+
+def _as_discs(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Return surfels; Gaussians that an initialiser has turned, which are not round, keep their axes."""
+    discs, is_round = as_surfels(gaussians, rng), np.ptp(gaussians.log_scales, axis=1) == 0  # [N]
+    return discs._replace(quats=np.where(is_round[:, None], discs.quats, gaussians.quats))

@@ -8,12 +8,8 @@ LOG_THICKNESS = -16.0  # 1e-7 world units: what other programs draw, and where c
 
 
 def as_surfels(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    """Return flat Gaussians. Round ones face at random, as the released code starts: those of 3DGS all face world z.
-
-    Those that are flat already keep their axes.
-    """
+    """Return flat Gaussians that face at random, as the released code starts: those of 3DGS all face world z."""
     quats = rng.uniform(size=gaussians.quats.shape).astype(gaussians.quats.dtype)
-    is_round = np.ptp(gaussians.log_scales, axis=1) == 0
     log_scales = gaussians.log_scales.copy()
     log_scales[:, 2] = LOG_THICKNESS
-    return gaussians._replace(quats=np.where(is_round[:, None], quats, gaussians.quats), log_scales=log_scales)
+    return gaussians._replace(quats=quats, log_scales=log_scales)
