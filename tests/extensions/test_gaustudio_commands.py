@@ -101,6 +101,7 @@ def test_the_study_of_the_sky(folder, tmp_path, capsys):
     assert main(["study", "gaustudio/sky", scene, *masks, *arms, "--out", str(tmp_path / "sky")]) == 0
     without, both = json.loads((tmp_path / "sky" / "result.json").read_text())["records"]
     assert both["opacity"] < 0.8 * without["opacity"] and both["psnr_sky"] > without["psnr_sky"]
+    assert both["opacity"] < both["opacity_scene"] <= 1
     assert "| ball+loss" in capsys.readouterr().out
     assert main(["study", "gaustudio/sky", scene, "--arms", "moon", "--out", str(tmp_path / "x")]) == 2
     assert "--arms moon is unknown: choose from without, loss, ball" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """The studies ``gaustudio/sky``, with and without a background, and ``gaustudio/swaps``, one stage at a time.
 
 Both train each arm with every seed and measure on the test views, within the masks of the sky and outside of them:
-PSNR, and the opacity of the scene alone. Masks are the ray tracer's for a synthetic scene, else those of ``--masks`` or
+PSNR, and the opacity of the scene without its background, which should be 0 there and 1 elsewhere. Masks are the ray tracer's for a synthetic scene, else those of ``--masks`` or
 of ``sky_mask=by_color``. Two pixels along their edges are left out, because a pixel of an edge shows both.
 """
 
@@ -44,9 +44,17 @@ SKY_ARMS: dict[str, dict[str, str]] = {
 """Settings by arm, as ``train --set`` takes them."""
 PUBLISHED = "as it is"
 SWAPPED = ("initialiser", "representation", "background", "photo_loss", "density")
-MEASURES = {"opacity": 4, "opacity_max": 2, "psnr": 2, "psnr_sky": 2, "psnr_scene": 2, "n_gaussians": 0}
+MEASURES = {
+    "opacity": 3,
+    "opacity_max": 2,
+    "opacity_scene": 3,
+    "psnr": 2,
+    "psnr_sky": 2,
+    "psnr_scene": 2,
+    "n_gaussians": 0,
+}
 """Columns, with their digits."""
-HEADING = ("mean opacity in the sky", "largest", "PSNR (dB)", "in the sky", "elsewhere", "Gaussians")
+HEADING = ("mean opacity in the sky", "largest", "mean elsewhere", "PSNR (dB)", "in the sky", "elsewhere", "Gaussians")
 
 
 class Subject(NamedTuple):
@@ -142,7 +150,7 @@ def outcome(subject: Subject, settings: Mapping[str, str], iterations: int, seed
     recipe = recipe_for(subject, settings, iterations)
     state = kit.train_with_progress(subject.scene, recipe, seed)
     shown = RenderSettings(subject.scene.background, renderer=recipe.renderer)
-    opacities, errors, sky_errors, scene_errors = [], [], [], []
+    opacities, scene_opacities, errors, sky_errors, scene_errors = [], [], [], [], []
     for stored in subject.scene.test_views:
         view = stored.load()
         output, _ = shown.render(state.model, view)
@@ -150,6 +158,7 @@ def outcome(subject: Subject, settings: Mapping[str, str], iterations: int, seed
         is_sky = subject.is_sky[view.name]
         inside, outside = (binary_erosion(mask, iterations=EDGE, border_value=1) for mask in (is_sky, ~is_sky))
         opacities.append(output.alpha[inside])
+        scene_opacities.append(output.alpha[outside])
         errors.append(psnr_of(squares))
         sky_errors.append(squares[inside])
         scene_errors.append(squares[outside])
@@ -157,6 +166,7 @@ def outcome(subject: Subject, settings: Mapping[str, str], iterations: int, seed
     return {
         "opacity": float(opacity.mean()) if opacity.size else None,
         "opacity_max": float(opacity.max()) if opacity.size else None,
+        "opacity_scene": float(np.concatenate(scene_opacities).mean()),
         "psnr": float(np.mean([error for error in errors if error is not None])),
         "psnr_sky": psnr_of(np.concatenate(sky_errors)),
         "psnr_scene": psnr_of(np.concatenate(scene_errors)),
