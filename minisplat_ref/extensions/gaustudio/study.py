@@ -1,8 +1,9 @@
 """The studies ``gaustudio/sky``, with and without a background, and ``gaustudio/swaps``, one stage at a time.
 
 Both train each arm with every seed and measure on the test views, within the masks of the sky and outside of them:
-PSNR, and the opacity of the scene without its background, which should be 0 there and 1 elsewhere. Masks are the ray tracer's for a synthetic scene, else those of ``--masks`` or
-of ``sky_mask=by_color``. Two pixels along their edges are left out, because a pixel of an edge shows both.
+PSNR, and the opacity of the scene without its background, which should be 0 in the sky and 1 elsewhere. Masks are the
+ray tracer's for a synthetic scene, else those of ``--masks`` or of ``sky_mask=by_color``. Two pixels along their edges
+are left out, because a pixel of an edge shows both.
 """
 
 import argparse
@@ -162,11 +163,11 @@ def outcome(subject: Subject, settings: Mapping[str, str], iterations: int, seed
         errors.append(psnr_of(squares))
         sky_errors.append(squares[inside])
         scene_errors.append(squares[outside])
-    opacity = np.concatenate(opacities)
+    opacity, scene_opacity = np.concatenate(opacities), np.concatenate(scene_opacities)
     return {
         "opacity": float(opacity.mean()) if opacity.size else None,
         "opacity_max": float(opacity.max()) if opacity.size else None,
-        "opacity_scene": float(np.concatenate(scene_opacities).mean()),
+        "opacity_scene": float(scene_opacity.mean()) if scene_opacity.size else None,
         "psnr": float(np.mean([error for error in errors if error is not None])),
         "psnr_sky": psnr_of(np.concatenate(sky_errors)),
         "psnr_scene": psnr_of(np.concatenate(scene_errors)),
