@@ -274,8 +274,8 @@ def test_the_rule_on_colours_by_hand():
 
 
 def test_masks_of_the_photograph_and_of_files(tmp_path):
-    mask = np.array([[True, False], [True, True]])
-    view = photograph(np.zeros((2, 2, 3)), mask)
+    mask = np.array([[True, False, True, True], [True, True, True, False]])
+    view = photograph(np.zeros((2, 4, 3)), mask)
     assert_array_equal(sky_masks.left_out(view, ""), ~mask)
     assert sky_masks.left_out(view._replace(mask=None), "") is None
     large = np.repeat(np.repeat(mask, 4, axis=0), 4, axis=1)
@@ -286,7 +286,7 @@ def test_masks_of_the_photograph_and_of_files(tmp_path):
     with pytest.raises(InputError, match=r"b\.png: there is no such mask; minisplat-ref gaustudio masks SCENE"):
         sky_masks.from_files(view._replace(name="b"), str(tmp_path))
     write_image(tmp_path / "c.png", large[:4])
-    with pytest.raises(InputError, match=r"c\.png has 8 x 4 pixels, which is not the shape of the photograph, 2 x 2"):
+    with pytest.raises(InputError, match=r"c\.png has 16 x 4 pixels, which is not the shape of the photograph, 4 x 2"):
         sky_masks.from_files(view._replace(name="c"), str(tmp_path))
 
 
