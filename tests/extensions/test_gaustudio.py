@@ -324,6 +324,15 @@ def test_initialisers(scene, rng, monkeypatch):
     assert found.sh_rest.shape[1:] == g.sh_rest.shape[1:]
 
 
+def test_a_training_begins_with_what_the_initialiser_gives(scene):
+    """After the first iteration there are grey Gaussians without moments, and other parameters are as trained."""
+    recipe = configure(scale_recipe(find_recipe("gaustudio"), 1), initialiser=initialisers.box)
+    state = train(scene, recipe, seed=0)
+    assert len(state.gaussians.means) == len(scene.points) and not state.gaussians.sh_dc.any()
+    assert not any(moment.any() for moment in (*state.adam.first, *state.adam.second))
+    assert state.shared_adam.first[SKY].any()
+
+
 def test_surfels_that_are_flat_already_keep_their_axes(rng):
     flat = make_gaussians(rng, 5)
     surfels = representations.surfels().extend(flat, rng)
