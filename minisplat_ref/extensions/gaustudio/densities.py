@@ -15,7 +15,7 @@ def clones(state: TrainState, iteration: Iteration) -> str | None:
 
 
 def halves(state: TrainState, iteration: Iteration) -> str | None:
-    """Each is replaced by two halves that together look the same, as in adaptive."""
+    """Each is replaced by two halves that look the same together."""
     means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
     apply_edit(state, halve(state.gaussians, np.flatnonzero(means >= THRESHOLD)))
     return None

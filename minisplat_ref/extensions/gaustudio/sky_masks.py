@@ -31,7 +31,7 @@ def by_color(view: View, mask_folder: str) -> Bools:
 
 
 def left_out(view: View, mask_folder: str) -> Bools | None:
-    """What the photograph's own mask leaves out, where no colours are learned."""
+    """What the photograph's own mask leaves out; no colours are learned there."""
     return None if view.mask is None else ~view.mask
 
 
