@@ -270,14 +270,16 @@ def as_trained(recipe: Recipe, model: Model) -> Recipe:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return the settings that :func:`configure` can replace, each with its present value, the first of several.
 
-    Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names;
+    Settings of events, of loss terms, and of the representation's ``extend``, ``shared`` and renderer go by their own
+    names;
     the weight of a loss term by the term's name; whether a calibration is on by the calibration's name; and
     ``starts_densely``.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
-    representation = [_settings(recipe.representation.extend), _settings(recipe.representation.renderer.render)]
+    of = recipe.representation
+    representation = [_settings(function) for function in (of.extend, of.shared, of.renderer.render)]
     start = [{START: recipe.starts_densely}]
     found = [*events, *terms, *switches, *representation, *start]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
@@ -318,6 +320,7 @@ def _with_setting(representation: Representation, name: str, value: Any) -> Repr
     renderer = representation.renderer
     return representation._replace(
         extend=_with(representation.extend, name, value),
+        shared=_with(representation.shared, name, value),
         renderer=renderer._replace(render=_with(renderer.render, name, value)),
     )
 
@@ -348,8 +351,9 @@ def configure_renderer(renderer: Renderer, settings: Iterable[str]) -> Renderer:
 def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return settings for :func:`configure` from text, each of the type of the present value.
 
-    A function is given by its name, such as ``metric=outdoor``; it must be defined in the module of the present one and
-    take the same arguments. For a number other than the weight of a loss term, ``none`` is None.
+    A function is given by its name, such as ``metric=outdoor``, one of :func:`alternatives_of` the present one. Text,
+    such as the path of a folder, is taken as it is. For a number other than the weight of a loss term, ``none`` is
+    None.
 
     Raises
     ------
@@ -368,7 +372,7 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
 
 def _parse(name: str, text: str, present: Any, may_be_none: bool) -> Any:
     if callable(present):
-        choices = _alternatives(present)
+        choices = alternatives_of(present)
         if text not in choices:
             raise InputError(f"--set {name}={text} names no function: choose from {', '.join(choices)}")
         return choices[text]
@@ -376,6 +380,8 @@ def _parse(name: str, text: str, present: Any, may_be_none: bool) -> Any:
         if text.lower() not in ("true", "false"):
             raise InputError(f"--set {name}={text} is neither true nor false")
         return text.lower() == "true"
+    if isinstance(present, str):
+        return text
     if text.lower() == "none" and may_be_none:
         return None
     try:
@@ -394,8 +400,11 @@ def _number(text: str) -> int | float:
     return int(value) if value.is_integer() else value
 
 
-def _alternatives(function: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
-    """Return by name the public functions in the module of this one that take the same arguments."""
+def alternatives_of(function: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
+    """Return by name the public functions in the module of this one that take the same arguments, itself among them.
+
+    These are what ``--set`` takes for a setting that is a function.
+    """
     names, module = list(inspect.signature(function).parameters), function.__module__
     functions = inspect.getmembers(sys.modules[module], inspect.isfunction)
     return {
@@ -422,7 +431,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe as numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
     fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
-    drawn = _settings(recipe.representation.renderer.render)
+    drawn = _named_settings(recipe.representation.renderer.render)
     return {
         **fields,
         **cooling,
@@ -469,8 +478,12 @@ def _plain(value: Any) -> Any:
 
 
 def _describe_function(function: Callable[..., Any], role: str) -> dict[str, Any]:
-    settings = {name: _name(value) if callable(value) else value for name, value in _settings(function).items()}
-    return {role: _name(function), "settings": settings}
+    return {role: _name(function), "settings": _named_settings(function)}
+
+
+def _named_settings(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the keyword arguments bound to a function, of functions their names."""
+    return {name: _name(value) if callable(value) else value for name, value in _settings(function).items()}
 
 
 def _name(function: Any) -> str:

@@ -297,6 +297,27 @@ MVG = {
     ),
 }
 
+GAUSTUDIO = {
+    **{name: row for name, row in GS_ACCEL.items() if not name.startswith(("clone_and_split", "photometric."))},
+    **rows("GauStudio, modules of 3DGS", photometric__photo_loss="l1_and_dssim", control_density__density="clones"),
+    **rows("3DGS, section 5.2", control_density=[steps(600, 14_900, 100)]),
+    **rows("GauStudio, initialisers", initialise=[[1]], initialise__initialiser="points"),
+    **rows(
+        "GauStudio, released code, the ball",
+        extend__representation="gaussians",
+        render__representation="gaussians",
+        render__background="ball",
+    ),
+    **rows(
+        f"{OURS}: the weight of the loss, the rate of the background, masks without a network",
+        sky_opacity=(0.1, 1),
+        sky_opacity__sky_mask="by_color",
+        sky_opacity__mask_folder="",
+        rate__sky=0.005,
+        control_density__min_gap=100,
+    ),
+}
+
 TABLES = {
     "3dgs": GS,
     "3dgs-accel": GS_ACCEL,
@@ -322,6 +343,7 @@ TABLES = {
         set_width__width=[0.5, 0.0],
     ),
     "fans": FANS,
+    "gaustudio": GAUSTUDIO,
     "gdgs": GDGS,
     "micro": MICRO,
     "mvg": MVG,
@@ -414,6 +436,10 @@ CONSTANTS = [
     ("antialiasing.method", "EPS2D", 0.1, "Mip-Splatting, released code"),
     ("analytic.reference", "LINEAR", 1.6, "Analytic-Splatting, its logistic curve"),
     ("analytic.reference", "CUBIC", 0.07, "Analytic-Splatting, its logistic curve"),
+    ("gaustudio.backgrounds", "N_BALL", 10_000, "GauStudio, released code"),
+    ("gaustudio.densities", "THRESHOLD", 2e-4, "3DGS, section 5.2"),
+    ("gaustudio.densities", "SIZE_FRACTION", 0.01, "3DGS, released code of 2023"),
+    ("gaustudio.losses", "DSSIM_WEIGHT", 0.2, "3DGS, section 5.1"),
     ("polygons.method", "LOG_THICKNESS", np.log(1e-5), "REdiSplats, released code"),
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),

@@ -351,6 +351,32 @@ def test_unknown_setting_lists_those_that_exist():
         parse_settings(MINI, {"a": "1", "b": "2"})
 
 
+def coloured(scene, rng, *, color, folder):
+    return {"table": color(3)}
+
+
+def grey(n_channels):
+    return np.full(n_channels, 0.5)
+
+
+def white(n_channels):
+    return np.full(n_channels, 1.0)
+
+
+def test_settings_of_shared_parameters_are_functions_and_text():
+    """A function by its name, which ``describe`` gives back, and text as it is."""
+    start = partial(coloured, color=grey, folder="")
+    recipe = brief()._replace(representation=LABELLED._replace(shared=start))
+    chosen = configure(recipe, **parse_settings(recipe, {"color": "white", "folder": "a b/c"}))
+    assert chosen.representation.shared(None, None)["table"].tolist() == [1, 1, 1]
+    assert chosen.representation.shared.keywords["folder"] == "a b/c"
+    with pytest.raises(InputError, match="color=black names no function: choose from grey, white"):
+        parse_settings(recipe, {"color": "black"})
+    drawn = SPLATTING._replace(render=partial(SPLATTING.render, color=white))
+    described = json.loads(json.dumps(describe(recipe._replace(representation=LABELLED._replace(renderer=drawn)))))
+    assert described["representation"]["renderer"] == {"color": "white"}
+
+
 def test_infinite_number_where_none_stands():
     """The present value says nothing of the type, and infinity is no whole number."""
     assert parse_settings(MINI, {"budget": "inf"}) == {"budget": np.inf}

@@ -3,7 +3,6 @@
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.gdgs.predictor import predict_centers
@@ -17,7 +16,7 @@ from minisplat_ref.extensions.gdgs.reference import (
     regions_of,
     unevenness,
 )
-from minisplat_ref.mechanisms.oriented.planes import fit_planes
+from minisplat_ref.mechanisms.oriented.planes import fit_planes, flatten_on_planes
 from minisplat_ref.methods.gaussian_splatting import (
     DENSIFY_LEAST_GAP,
     GS_ACCEL,
@@ -33,7 +32,6 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Gaussians
 
 N_POINTS_LEAST = 3  # of a plane
-FLATNESS = 0.3  # thickness of a Gaussian at the start, relative to its radius
 PERIOD = 100
 N_CELLS, N_TOP = 5, 20
 WEIGHTS = Weights(distance=1.0, angle=0.01, spacing=0.0)
@@ -43,13 +41,7 @@ def on_planes(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
     """Return Gaussians at the predictor's centres, flattened onto the planes of their neighbours."""
     if n_rows(gaussians) < N_POINTS_LEAST:
         return gaussians
-    dtype = gaussians.means.dtype
-    centers = predict_centers(gaussians.means.astype(np.float64), rng)
-    planes = fit_planes(centers)
-    quats = Rotation.from_matrix(planes.axes).as_quat()[:, [3, 0, 1, 2]]
-    log_scales = gaussians.log_scales.copy()
-    log_scales[:, 2] += np.log(FLATNESS)
-    return gaussians._replace(means=centers.astype(dtype), quats=quats.astype(dtype), log_scales=log_scales)
+    return flatten_on_planes(gaussians, predict_centers(gaussians.means.astype(np.float64), rng))
 
 
 def surface_attraction(rendered: Rendered, *, weights: Weights, offset: float, period: int) -> tuple[float, Cotangents]:

@@ -12,12 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Floats, Gaussians
 
 N_NEIGHBOURS = 12
 N_AXES = 3
+FLATNESS = 0.3  # thickness of a Gaussian at the start, relative to its radius
 
 
 class LocalPlanes(NamedTuple):
@@ -72,3 +74,18 @@ def fit_planes(points: Floats, n_neighbours: int = N_NEIGHBOURS, towards: Floats
         axes[:, :, 2] *= np.where(np.sum(axes[:, :, 2] * (nearest - points), axis=1) < 0, -1.0, 1.0)[:, None]
     axes[:, :, 1] *= np.sign(np.linalg.det(axes))[:, None]
     return LocalPlanes(centers, axes, np.sqrt(np.maximum(values[:, ::-1], 0)))
+
+
+def flatten_on_planes(gaussians: Gaussians, centers: Floats) -> Gaussians:
+    """Return Gaussians at ``centers`` [N, 3], flattened onto the planes of their neighbours there.
+
+    Raises
+    ------
+    InputError
+        There are fewer than 3.
+    """
+    dtype = gaussians.means.dtype
+    quats = Rotation.from_matrix(fit_planes(centers).axes).as_quat()[:, [3, 0, 1, 2]]
+    log_scales = gaussians.log_scales.copy()
+    log_scales[:, 2] += np.log(FLATNESS)
+    return gaussians._replace(means=centers.astype(dtype), quats=quats.astype(dtype), log_scales=log_scales)
