@@ -81,6 +81,7 @@ def test_a_pixel_needs_its_block_and_those_around_it():
     is_needed[:], is_needed[2, 3] = False, True
     assert_array_equal(foveation._find_needed_samples(is_needed, 2), [[1, 1, 1, 0]] * 3)
     assert_array_equal(foveation._find_needed_samples(is_needed, 1), is_needed)
+    assert_array_equal(foveation._find_needed_samples(np.zeros((5, 7), bool), 2), np.zeros((3, 4), bool))
 
 
 # --- images ---
@@ -129,6 +130,26 @@ def test_the_fovea_is_drawn_in_full_and_the_rest_is_near(rng):
     assert 0 < error[angles > 20].max() < 0.3 and error.mean() < 0.02
     assert [zone.block for zone in zones] == [1, 2, 4] and all(zone.n_tiles > 0 for zone in zones)
     assert sum(zone.n_samples for zone in zones) < 0.8 * 80 * 60
+
+
+@pytest.mark.parametrize("size", [(80, 60), (77, 53)])
+def test_zones_are_images_of_cameras_with_larger_pixels(size, rng):
+    """One projection for all zones, and lists of their tiles alone, draw what projecting for each camera draws."""
+    camera, gaze = make_camera(*size, fx=60.0, fy=50.0, rng=rng), Gaze(20, 30, 5.0)
+    model = Model(make_gaussians(rng, 60, size=0.2))
+    image, zones = render_foveated(model, camera, REQUEST, gaze, BUFFER)
+    expected = np.zeros_like(image)
+    for k, weight in enumerate(zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full)):
+        block, n_pairs = 2**k, 0
+        coarse = foveation._coarser(camera, block)
+        low_pass = GSPLAT_MAIN._replace(eps2d=GSPLAT_MAIN.eps2d / block**2)  # of the whole image's pixels
+        output, tape = HEADSET.renderer.render(model, view_from(coarse), REQUEST._replace(conventions=low_pass))
+        expected += weight[:, :, None] * foveation._interpolate(output.image, block, weight.shape)
+        is_needed = foveation._find_needed_samples(weight > 0, block)
+        tiles = foveation._find_needed_tiles(is_needed, tape.bins.grid)
+        n_pairs = int(np.diff(tape.bins.tile_offsets)[tiles].sum())
+        assert zones[k].n_tiles == tiles.sum() > 0 and n_pairs <= zones[k].n_pairs <= 1.3 * n_pairs + 5
+    assert_allclose(image, expected, rtol=0, atol=1e-12)
 
 
 def test_what_is_smooth_is_interpolated_exactly():
