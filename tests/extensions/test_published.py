@@ -300,6 +300,7 @@ TABLES = {
     "cuts": GS_ACCEL
     | rows(
         f"{OURS}: the paper's edges are hard, with another gradient",
+        extend__n_curves=1,
         rate__curves=0.01,
         rate__widths=0.0,
         set_width=[[15_000], [30_000]],

@@ -13,13 +13,13 @@ from minisplat_ref.types import Floats, Gaussians
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer as a stage; the reference finds which hits count, and which part of a curve is nearest."""
+    """Return the renderer of two curves as a stage; the reference finds which hits count, and what is nearest."""
     return (renderer_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
 
 
 def _near(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
     """Return Gaussians whose curves pass through their bright parts; otherwise little would depend on them."""
-    population = with_cuts(gaussians, rng)
+    population = with_cuts(gaussians, rng, n_curves=2)
     return population._replace(curves=0.4 * population.curves)
 
 
