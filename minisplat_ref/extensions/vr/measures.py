@@ -223,10 +223,10 @@ def draw_orders(rows: list[dict[str, Any]]) -> Figure:
     """Draw the pairs in the wrong order against the work."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    for row in rows:
+    for i, row in enumerate(rows):
         x, y = (row["n_depths"] + row["n_steps"]) / row["n_hits"], row["n_wrong"] / max(row["n_pairs"], 1)
         axes.plot(x, y, "o", color=RED if row["order"] == queues.HIERARCHY.name else BLUE)
-        axes.annotate(row["order"], (x, y), fontsize=8, xytext=(4, 4), textcoords="offset points")
+        axes.annotate(row["order"], (x, y), fontsize=8, xytext=(6, 8 - 8 * (i % 3)), textcoords="offset points")
     axes.set_yscale("symlog", linthresh=1e-5)
     axes.set(title="Pairs of hits in the wrong order", xlabel="depths and steps of insertion, per hit", ylabel="share")
     return figure
