@@ -98,7 +98,7 @@ def n_crossings(points: Floats, offsets: Floats) -> Ints:
     different sides of the edge. Zero counts as negative, so a line through a vertex crosses one of its two edges, or
     both or none.
     """
-    curves = points.reshape(len(points), -1, N_POINTS, 2)  # [G, M, 4, 2]
+    curves = points.reshape(len(points), points.shape[1] // N_POINTS, N_POINTS, 2)  # [G, M, 4, 2]
     V = np.einsum("ij,gmjk->gmik", VERTICES.astype(points.dtype), curves)[:, None]  # [G, 1, M, N_EDGES + 1, 2]
     d = offsets[:, :, None, None]
     is_left = _cross(d, V) > 0  # [G, P, M, N_EDGES + 1]

@@ -210,8 +210,9 @@ def response_for(n_curves: int, dtype: np.dtype) -> KernelResponse:
 
 def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype) -> Floats:
     points, widths = footprints.points.astype(np.float64), footprints.widths
-    n, columns = len(points), columns_of(points.shape[1] // N_POINTS)
-    vertices = np.einsum("ij,nmjk->nmik", VERTICES, points.reshape(n, -1, N_POINTS, 2))  # [N, M, N_EDGES + 1, 2]
+    n, n_curves = len(points), points.shape[1] // N_POINTS
+    columns = columns_of(n_curves)
+    vertices = np.einsum("ij,nmjk->nmik", VERTICES, points.reshape(n, n_curves, N_POINTS, 2))  # [N, M, N_EDGES + 1, 2]
     pieces = np.concatenate([np.diff(vertices, axis=2), vertices[:, :, [0, -1]]], axis=2)
     records = np.zeros((n, columns.n), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
