@@ -124,7 +124,7 @@ PLAIN = replace(
     composite=cpu_plain_conic.composite,
     composite_vjp=cpu_plain_conic.composite_vjp,
 )
-"""The same with the kernels that blend any primitive; they have no statistics, so it is not in ``BACKENDS``."""
+"""The same with the kernels that blend any primitive; slower, so it is not in ``BACKENDS``."""
 
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
 """The backends that are there on every machine."""

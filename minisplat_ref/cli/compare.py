@@ -86,7 +86,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing (default 8)"
     )
-    parser.add_argument("--init", type=Path, metavar="PLY", help="as for train: points to start from")
+    parser.add_argument("--init", type=Path, metavar="START", help="as for train: points or run to start from")
     parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
     parser.set_defaults(run=run)
 

@@ -107,7 +107,7 @@ def add_parser(commands: Commands) -> None:
         help="adaptive (default), 3dgs-accel, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
         " mini-splatting2-d",
     )
-    training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
+    training.add_argument("--init", type=Path, metavar="START", help="points (PLY) or run to start from")
     training.add_argument(
         "--iterations",
         type=integer(1),
@@ -263,17 +263,17 @@ def _default_iterations(name: str) -> int:
 
 
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
-    """Return the state before the first iteration, from the scene's points or from those of --init."""
-    from minisplat_ref.runs.start import load_start
+    """Return the state before the first iteration, from the scene's points or from what --init gives."""
+    from minisplat_ref.runs.start import start_from
     from minisplat_ref.training.initial_state import initial_state
 
-    start, notices = (scene, []) if settings.init is None else load_start(settings.init, scene)
-    for notice in notices:
+    if settings.init is None:
+        return initial_state(scene, recipe, settings.seed)
+    start = start_from(settings.init, scene, recipe, settings.seed)
+    for notice in start.notices:
         print(f"minisplat-ref: {notice}", file=sys.stderr)
-    if settings.init is not None:
-        print(f"starts from {len(start.points):,} points of {settings.init}")
-        recipe = recipe._replace(starts_densely=False)  # from these points, as asked
-    return initial_state(start, recipe, settings.seed)
+    print(f"starts from {start.source}")
+    return start.state
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:

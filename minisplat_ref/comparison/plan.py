@@ -10,7 +10,7 @@ from minisplat_ref.io import load_scene
 from minisplat_ref.io.frames import place_scene
 from minisplat_ref.lpips import check_views, load_network
 from minisplat_ref.runs import run_folder
-from minisplat_ref.runs.start import load_start
+from minisplat_ref.runs.start import start_from
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
@@ -69,7 +69,7 @@ class Plan(NamedTuple):
     lpips_weights: Path | None = None
     """File of the weights of LPIPS; None: it is not measured."""
     init: Path | None = None
-    """PLY of the points that every training starts from; None for the scene's own."""
+    """PLY of the points, or folder of the run, that every training starts from; None for the scene's own points."""
 
     @property
     def files(self) -> dict[str, str]:
@@ -147,9 +147,11 @@ def check(plan: Plan) -> Scene:
         raise InputError(f"scene {scene.name} has no test views to compare on: give --test-every above 0")
     if plan.lpips_weights is not None:
         check_views(load_network(plan.lpips_weights), scene.test_views)
-    start = scene if plan.init is None else load_start(plan.init, scene)[0]
     for recipe in recipes:
-        initial_state(start, recipe, seed=0)
+        if plan.init is None:
+            initial_state(scene, recipe, seed=0)
+        else:
+            start_from(plan.init, scene, recipe, seed=0)
     return scene
 
 

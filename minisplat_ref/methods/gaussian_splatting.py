@@ -138,6 +138,14 @@ GS = Recipe(
 )
 """``3dgs``."""
 
+FINE_TUNING = GS._replace(
+    name="fine-tuning",
+    learning_rates=GS.learning_rates.change(**GS.learning_rates.at(GS.iterations, extent=1.0)),
+    sh_milestones=(0, 0, 0),
+    events=(),
+)
+"""3DGS after its last iteration: the means at their last rate, all harmonics, and the number of Gaussians stays."""
+
 GS_ACCEL = GS._replace(
     name="3dgs-accel",
     learning_rates=GS.learning_rates.change(opacity_logits=2.5e-2),

@@ -13,10 +13,12 @@ It is exact for one Gaussian, unless the pixel stops before its last hit: withou
 additive: of two Gaussians one behind the other, each alone may be superfluous.
 """
 
+from typing import Any
+
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.reference.hits import CONIC, Response, sort_by, tile_hits, undo_sort_by
 from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
 
 
@@ -49,11 +51,42 @@ def removal_changes(
     changes : ndarray of shape (N,)
         S, float64, in squared units of the channels; 0 for Gaussians without hits.
     """
+    return removal_changes_of_hits(CONIC, projection, colors, bins, conventions, output)
+
+
+def removal_changes_of_hits(
+    response: Response,
+    primitives: Any,
+    colors: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+) -> Floats:
+    """Return the squared change of the image without each primitive, in the order in which pixels take their hits.
+
+    Parameters
+    ----------
+    response, primitives, colors, bins, conventions
+        As for :func:`~minisplat_ref.reference.compositing.composite_hits`.
+    output : RenderOutput
+        As for :func:`removal_changes`.
+
+    Returns
+    -------
+    changes : ndarray of shape (N,)
+        As from :func:`removal_changes`.
+    """
     changes = np.zeros(len(colors))
-    for tile in tile_hits(projection, bins, conventions):
-        alphas = tile.alphas[:, :, None]  # [G, P, 1]
-        lights = alphas * tile.transmittances[:-1, :, None] * colors[tile.ids][:, None]  # [G, P, D] w_g c_g
+    for tile in tile_hits(primitives, bins, conventions, response):
+        alphas = sort_by(tile.order, tile.alphas)  # [G, P]
+        if response.shade is None:
+            c = np.broadcast_to(colors[tile.ids][:, None], (*alphas.shape, colors.shape[1]))
+        else:
+            c = response.shade(colors[tile.ids], tile.hit.place)
+        c = c if tile.order is None else np.take_along_axis(c, tile.order[:, :, None], axis=0)  # [G, P, D]
+        lights = (alphas * tile.transmittances[:-1])[:, :, None] * c  # w_g c_g
         B = output.image[tile.ys, tile.xs] - np.cumsum(lights, axis=0)
-        q = lights - alphas / (1 - alphas) * B
-        changes[tile.ids] += np.sum(q**2, axis=(1, 2), dtype=np.float64)
+        q = lights - (alphas / (1 - alphas))[:, :, None] * B
+        squares = np.sum(q**2, axis=2, dtype=np.float64)  # [G, P]
+        changes[tile.ids] += undo_sort_by(tile.order, squares).sum(axis=1)
     return changes

@@ -90,7 +90,7 @@ class Settings(NamedTuple):
     max_bytes: int | None = None
     """Size that the PLY of a simplification after the training may have; None: there is none."""
     init: str | None = None
-    """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
+    """Absolute path of the PLY or run that the training starts from, not read again; None for the scene's points."""
     model: str | None = None
     """Folder of the COLMAP model, relative to the scene; None for the first that is there."""
     background: list | None = None

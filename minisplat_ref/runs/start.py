@@ -1,13 +1,141 @@
-"""The points that a training starts from in place of the scene's own: ``--init``."""
+"""What a training starts from in place of the scene's own points: a point cloud, or the model of a run (``--init``)."""
 
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import CORE, owner_of
 from minisplat_ref.io.frames import place_points
 from minisplat_ref.io.ply import MEANS, NORMALS, load_points
 from minisplat_ref.io.ply_file import property_names
+from minisplat_ref.runs.checkpoints import newest_model
+from minisplat_ref.runs.run_folder import POINT_CLOUD
+from minisplat_ref.runs.settings import load, load_frame, place_model, return_model
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, are_seen
-from minisplat_ref.types import Scene
+from minisplat_ref.strategy.ops import contiguous, n_rows
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import Gaussians, Model, Scene
+
+
+class Start(NamedTuple):
+    """The state before the first iteration of a training that is given what to start from."""
+
+    state: TrainState
+    source: str
+    """What it starts from, in one line."""
+    notices: list[str]
+    """Sentences on what the source lacks."""
+
+
+def start_from(path: str | Path, scene: Scene, recipe: Recipe, seed: int) -> Start:
+    """Return the start from a point cloud, or from the model of a run where the path is a folder.
+
+    Parameters
+    ----------
+    path : str or Path
+        See :func:`load_start` and :func:`continue_model`.
+    scene : Scene
+    recipe : Recipe
+    seed : int
+        Of all random draws.
+
+    Raises
+    ------
+    InputError
+        The path holds neither, or it does not fit the scene or the recipe.
+    """
+    recipe = recipe._replace(starts_densely=False)  # from these points, as asked
+    if Path(path).is_dir():
+        return continue_model(Path(path), scene, recipe, seed)
+    start, notices = load_start(path, scene)
+    return Start(initial_state(start, recipe, seed), f"{len(start.points):,} points of {path}", notices)
+
+
+def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Start:
+    """Return the start of a training from the model of a run, which may have another recipe and another renderer.
+
+    The Gaussians of 3DGS become the recipe's population as those of the scene's points would. What the training of the
+    run has besides its model does not go on: moments, statistics and the order of the views begin afresh.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run that has ended or has a checkpoint.
+    scene : Scene
+        In the same world as the run's.
+    recipe : Recipe
+    seed : int
+
+    Raises
+    ------
+    InputError
+        The folder holds no run; its population, or its parameters of photographs and sky, are not what the recipe
+        trains; or no training view sees the model.
+    """
+    theirs = load(folder)
+    owner = owner_of(theirs.recipe, theirs.extension) or CORE
+    saved = newest_model(folder, theirs)
+    model = place_model(return_model(saved.model, owner, load_frame(folder)), owner, scene.frame)
+    if not are_seen(model.gaussians.means, [view.camera for view in scene.train_views]).any():
+        raise InputError(
+            f"{folder}: no training view sees any of its {n_rows(model.gaussians):,} Gaussians; give a run of scene"
+            f" {scene.name}"
+        )
+    state = initial_state(scene, recipe, seed)
+    rng = np.random.default_rng(seed)
+    state.gaussians = contiguous(_as_population(folder, model, owner.representation.name, recipe, rng))
+    state.adam = zero_moments(state.gaussians)
+    _check_shared(folder, model, state, recipe)
+    state.shared = {name: np.array(model.shared.get(name, first)) for name, first in state.shared.items()}
+    state.rng = rng
+    drawn = owner.representation.renderer.name
+    ours = recipe.representation.renderer.name
+    source = f"{n_rows(state.gaussians):,} Gaussians of {folder}, trained with {theirs.recipe} and rendered by {drawn}"
+    unfinished = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
+    notices = [] if saved.unfinished is None else [unfinished]
+    return Start(state, source if drawn == ours else f"{source}, here by {ours}", notices)
+
+
+def _as_population(folder: Path, model: Model, name: str, recipe: Recipe, rng: np.random.Generator) -> Any:
+    """Return a model's primitives as the recipe's population.
+
+    Raises
+    ------
+    InputError
+        They are of another kind, ``name``, that has fields which the recipe does not train.
+    """
+    wanted = recipe.representation
+    if wanted.name == name:
+        return model.gaussians
+    if type(model.gaussians) is Gaussians:
+        return wanted.extend(model.gaussians, rng)
+    further = ", ".join(field for field in model.gaussians._fields if field not in Gaussians._fields)
+    raise InputError(
+        f"{folder} holds {name} with {further or 'other fields'}, which recipe {recipe.name} does not train: take a"
+        f" recipe of its extension, or give --init {folder / POINT_CLOUD} to start from its points alone"
+    )
+
+
+def _check_shared(folder: Path, model: Model, state: TrainState, recipe: Recipe) -> None:
+    """Refuse parameters without rows that the recipe does not train, or for another number of photographs."""
+    for name, values in model.shared.items():
+        if name not in state.shared:
+            switches = [c.name for c in recipe.calibrations if name in c.initial(1)]
+            way_out = f"add --set {switches[0]}=true" if switches else "take the recipe of that run"
+            raise InputError(
+                f"{folder} has parameters {name} besides its Gaussians, which recipe {recipe.name} does not train:"
+                f" {way_out}"
+            )
+        if state.shared[name].shape != values.shape:
+            raise InputError(
+                f"{folder} has parameters {name} of shape {values.shape}, and here they have"
+                f" {state.shared[name].shape}: give the photographs of that run, divided by the same --test-every"
+            )
 
 
 def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:

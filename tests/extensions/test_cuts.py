@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from matplotlib.path import Path as Polygon
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
@@ -14,21 +14,24 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.cuts import card
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.cuts import card, edge
 from minisplat_ref.extensions.cuts.curve import (
     N_EDGES,
+    N_PIECES,
     VERTICES,
     bernstein,
     evaluate_cuts,
     evaluate_cuts_vjp,
     n_crossings,
 )
-from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians
+from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
-from minisplat_ref.types import Gaussians, Primitives, view_from
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 from payloads import drawn, random_cuts
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 HARD, SOFT = np.zeros(1), np.ones(1)
 LOOP = np.array([[[2.0, -5.0], [9.0, -6.0], [6.0, 7.0], [-2.5, 5.0]]])  # px; beside the centre
@@ -113,7 +116,30 @@ def test_degenerate_curves_are_finite_and_cut_nothing_if_they_have_no_breadth(po
     assert 0.3 < share < 0.7 if np.ptp(points[0, :, 1]) > 1 else share > 0.999
 
 
-@pytest.mark.parametrize("points", [LOOP, AROUND], ids=["beside", "around"])
+def test_where_two_shadows_overlap_it_is_visible_again():
+    """An even number of crossings of all curves: the hard mask of two is the exclusive or of their shadows."""
+    d, both = grid(), np.concatenate([LOOP, AROUND], axis=1)
+    alone = [evaluate_cuts(points, HARD, d) for points in (LOOP, AROUND)]
+    found = evaluate_cuts(both, HARD, d)
+    is_cut = [one.masks == 0 for one in alone]
+    assert (is_cut[0] & is_cut[1]).sum() > 20 and (found.masks == (is_cut[0] == is_cut[1])).all()
+    assert_array_equal(n_crossings(both, d), n_crossings(LOOP, d) + n_crossings(AROUND, d))
+
+
+def test_the_soft_mask_of_two_curves_is_that_of_the_nearer():
+    d, both = grid(), np.concatenate([LOOP, AROUND], axis=1)
+    alone = [evaluate_cuts(points, SOFT, d) for points in (LOOP, AROUND)]
+    distances = [np.linalg.norm(one.away, axis=2) for one in alone]
+    sign = np.where(alone[0].is_visible == alone[1].is_visible, 1, -1)
+    assert_allclose(evaluate_cuts(both, SOFT, d).masks, 1 / (1 + np.exp(-sign * np.minimum(*distances))), rtol=1e-12)
+    is_nearer = distances[1] < distances[0]
+    assert 0.1 < is_nearer.mean() < 0.9
+    assert_array_equal(evaluate_cuts(both, SOFT, d).pieces // N_PIECES, is_nearer)
+
+
+@pytest.mark.parametrize(
+    "points", [LOOP, AROUND, np.concatenate([AROUND, LOOP], axis=1)], ids=["beside", "around", "both"]
+)
 def test_the_gradient_of_the_mask(points, rng):
     d = rng.uniform(-5, 8, size=(1, 12, 2))
     check_jacobian(
@@ -124,9 +150,10 @@ def test_the_gradient_of_the_mask(points, rng):
     )
 
 
-def test_the_gradient_of_the_points(rng):
+@pytest.mark.parametrize("n_curves", [1, 2])
+def test_the_gradient_of_the_points(n_curves, rng):
     camera = make_camera(rng=rng)
-    curves, means = rng.normal(size=(3, 8)), rng.normal(size=(3, 3)) + np.array([0, 0, 4])
+    curves, means = rng.normal(size=(3, 8 * n_curves)), rng.normal(size=(3, 3)) + np.array([0, 0, 4])
     quats, scales = rng.normal(size=(3, 4)), rng.uniform(0.1, 0.4, size=(3, 3))
     pose = [camera.cam_from_world_R, camera.cam_from_world_t]
 
@@ -162,6 +189,75 @@ def test_needles_and_curves_through_the_centre(rng):
         assert all(np.isfinite(field).all() for field in (*v_ours.gaussians, *v_theirs.gaussians))
 
 
+@pytest.mark.parametrize("n_curves", [2, 3])
+def test_kernels_and_reference_agree_on_several_curves(n_curves, rng):
+    """Every image and every gradient; all curves have one."""
+    population = random_cuts(rng, make_gaussians(rng, 30, size=0.4), n_curves)
+    view = view_from(make_camera(rng=rng))
+    for dtype, image_rel, rel in (
+        (np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64),
+        (np.float32, PARITY_FLOAT32_IMAGE, PARITY_FLOAT32_GRADIENT),
+    ):
+        theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE, compared_to=dtype)
+        ours, v_ours = drawn(RENDERER, as_dtype(population, dtype), view, CPU)
+        assert np.abs(ours.image - theirs.image).max() <= image_rel
+        assert v_ours.gaussians.curves.shape == (30, 8 * n_curves)
+        for name in ("curves", "means", "log_scales", "opacity_logits"):
+            mine, yours = (np.asarray(getattr(v.gaussians, name), np.float64) for v in (v_ours, v_theirs))
+            assert np.abs(mine - yours).max() <= rel * np.abs(yours).max(), name
+        by_curve = np.abs(v_theirs.gaussians.curves).reshape(30, n_curves, 8).sum(axis=(0, 2))
+        assert (by_curve > 0.02 * by_curve.max()).all()
+
+
+def test_a_second_curve_that_is_far_away_changes_no_byte_of_the_image(backend, rng):
+    """Nor the gradients, but for the order in which the compiler adds."""
+    one = random_cuts(rng, make_gaussians(rng, 20))
+    far = np.full((20, 8), 1e6)
+    two, view = one._replace(curves=np.hstack([one.curves, far])), view_from(make_camera(rng=rng))
+    (image, v), (image_of_two, v_of_two) = (drawn(RENDERER, population, view, backend) for population in (one, two))
+    assert_array_equal(image_of_two.image, image.image)
+    assert_allclose(v_of_two.gaussians.curves[:, :8], v.gaussians.curves, rtol=1e-9, atol=1e-12)
+    assert not v_of_two.gaussians.curves[:, 8:].any() and np.abs(v.gaussians.curves).max() > 0.01
+    assert_allclose(v_of_two.gaussians.means, v.gaussians.means, rtol=1e-9, atol=1e-12)
+
+
+def test_the_number_of_curves(rng):
+    gaussians = make_gaussians(rng, 5)
+    three = with_cuts(gaussians, rng, n_curves=3).curves.reshape(5, 3, 4, 2)
+    middles = three.mean(axis=2)
+    assert_allclose(np.linalg.norm(middles, axis=2), 1, rtol=CLOSED_FORM)
+    assert_allclose(middles.sum(axis=1), 0, atol=CLOSED_FORM)  # evenly around the centre
+    for wrong in (0, 5):
+        with pytest.raises(InputError, match=f"n_curves is {wrong}: give 1 to 4"):
+            with_cuts(gaussians, rng, n_curves=wrong)
+    odd = with_cuts(gaussians, rng)._replace(curves=np.zeros((5, 12)))
+    with pytest.raises(InputError, match="curves have 12 numbers per Gaussian"):
+        RENDERER.render(Model(odd), view_from(make_camera()), Request())
+
+
+# --- a window of a photograph ---
+
+
+def test_the_window_with_the_strongest_edge_is_found():
+    """A slanted edge in a corner, and beside it a finer pattern of more contrast but without a direction."""
+    photograph = np.full((110, 150, 3), 0.5)
+    ys, xs = np.mgrid[:110, :150]
+    photograph[50:110, 90:150] = np.where(xs + 0.5 * ys > 160, 0.9, 0.2)[50:110, 90:150, None]
+    photograph[:48, :48] = 0.45 + 0.1 * ((xs // 4 + ys // 4) % 2)[:48, :48, None]
+    target, (x, y) = edge.find_edge(photograph)
+    assert 80 <= x <= 102 and 44 <= y <= 62
+    assert_array_equal(target.image, photograph[y : y + card.SIZE, x : x + card.SIZE])
+    assert 0.03 < target.band.mean() < 0.3
+    with pytest.raises(InputError, match="30 x 110 pixels, and an edge takes a window of 48 x 48"):
+        edge.find_edge(photograph[:, :30])
+
+
+def test_the_band_is_a_pixel_and_a_half_wide():
+    gradients = np.zeros((9, 9))
+    gradients[:, 4], gradients[:, 8] = 1.0, 0.49  # the second is too weak
+    assert_array_equal(edge.near_strong(gradients)[3], np.isin(np.arange(9), [3, 4, 5]))
+
+
 # --- from end to end ---
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -194,7 +290,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
 def test_one_gaussian_with_a_cut_is_a_cut_gaussian():
     """Starting with a curve on the right side it is reproduced; 3DGS spills over the edge."""
     target = card.cut_gaussian()
-    plain, found = (card.measure_card(target, card.fit_card(target, 1, is_cut, 300, 3)) for is_cut in (False, True))
+    plain, found = (card.measure_card(target, card.fit_card(target, 1, n, 300, 3)) for n in (0, 1))
     assert found["psnr"] > plain["psnr"] + 20 and found["edge_width"] < 2 < plain["edge_width"]
 
 
@@ -214,6 +310,13 @@ def test_the_study(tmp_path, monkeypatch, capsys):
     assert main(["study", "cuts/card", "--iterations", "5", "--seeds", "2", "--out", str(out)]) == 0
     assert len(json.loads((out / "result.json").read_text())["rows"]) == 4
     assert (out / "figure.png").stat().st_size > 10_000 and "| cut Gaussian" in capsys.readouterr().out
+    monkeypatch.setattr(edge, "NUMBERS", ((2,), (2,), (2,)))
+    photographs = tmp_path / "photographs"
+    write_scene(make_scene("room", supersampling=1, **SCENE | {"width": 56, "height": 50}), photographs, SCENE)
+    options = ["--iterations", "4", "--seeds", "2", "--out", str(tmp_path / "edge")]
+    assert main(["study", "cuts/edge", str(photographs), *options]) == 0
+    rows = json.loads((tmp_path / "edge" / "result.json").read_text())["rows"]
+    assert [row["n_floats"] for row in rows] == [28, 44, 60] and "| 2 curves" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
         main(["study", "cuts/card", "--seeds", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()

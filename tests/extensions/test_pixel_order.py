@@ -365,14 +365,53 @@ def test_no_gaussians(backend, rng):
     assert DRAW.render(Model(none), view_from(make_camera()), Request(backend=backend))[0].image.max() == 0
 
 
-def test_depth_and_statistics(rng):
-    """Statistics are those of 3DGS's footprints; colours and depths are not."""
+def test_depth_and_statistics(backend, rng):
+    """Weights add up to this renderer's own alpha; a removed Gaussian changes its own image by what is said."""
     some, view = Model(make_gaussians(rng, 20)), view_from(make_camera())
-    request = Request(backend=REFERENCE, wants=frozenset({"depth", "stats", "surface"}))
-    output, splatted = (renderer.render(some, view, request)[0] for renderer in (DRAW, SPLATTING))
+    wants = frozenset({"depth", "stats", "surface", "dominant_depth", "median_depth"})
+    output, splatted = (
+        renderer.render(some, view, Request(backend=backend, wants=wants))[0] for renderer in (DRAW, SPLATTING)
+    )
     assert output.image.shape == (18, 24, 4) and np.abs(output.image - splatted.image).max() > 1e-3
-    assert output.stats.hit_count.sum() > 0 and "surface" in output.extras
-    assert_array_equal(output.stats.blend_weight_sum, splatted.stats.blend_weight_sum)
+    assert_allclose(output.stats.blend_weight_sum.sum(), output.alpha.sum(), rtol=CLOSED_FORM)
+    assert np.abs(output.stats.blend_weight_sum - splatted.stats.blend_weight_sum).max() > 1e-3
+    is_hit = output.stats.dominant_ids >= 0
+    assert ((output.extras["dominant_depth"] > 0) == is_hit).all() and 0.2 < is_hit.mean() < 1
+    assert_array_equal(output.stats.dominant_count, np.bincount(output.stats.dominant_ids[is_hit], minlength=20))
+
+    request = Request(np.ones(3), backend=backend, wants=frozenset({"removal_changes"}))
+    whole, _ = DRAW.render(some, view, request)
+    g = int(np.argmax(whole.extras["removal_changes"]))
+    gone = some.gaussians._replace(opacity_logits=np.where(np.arange(20) == g, -50.0, some.gaussians.opacity_logits))
+    without = DRAW.render(Model(gone), view, request)[0].image
+    assert_allclose(whole.extras["removal_changes"][g], np.sum((without - whole.image) ** 2), rtol=1e-9)
+
+
+def test_what_is_in_front_on_the_ray_dominates(backend):
+    """A long Gaussian slants away from the camera; a ball is nearer than its mean, but behind its near end.
+
+    Sorted by the means' depths the ball of alpha 0.6 comes first everywhere, and dominates. On the ray through the
+    ball's middle the needle, of some 0.66, is in front, and takes T below one half.
+    """
+    camera = make_camera(40, 40, fx=40.0, fy=40.0)
+    slant = np.pi / 8  # half of the turn about y that takes the long axis from x to (1, 0, -1)
+    needle, ball = (0.0, 0.0, 4.0), (1.0, 0.0, 3.6)
+    gaussians = Gaussians(
+        means=np.array([needle, ball]),
+        quats=np.array([[np.cos(slant), 0, np.sin(slant), 0], [1.0, 0, 0, 0]]),
+        log_scales=np.log([[2.0, 0.3, 0.05], [0.3, 0.3, 0.3]]),
+        opacity_logits=np.log([0.9 / 0.1, 0.6 / 0.4]),
+        sh_dc=np.zeros((2, 3)),
+        sh_rest=np.zeros((2, 0, 3)),
+    )
+    request = Request(backend=backend, wants=frozenset({"stats", "median_depth"}))
+    view = view_from(camera)
+    ours, theirs = (renderer.render(Model(gaussians), view, request)[0] for renderer in (DRAW, SPLATTING))
+    row, column = int(camera.cy), int(camera.cx + 40 * ball[0] / ball[2])  # the ray through the ball's middle
+    assert theirs.stats.dominant_ids[row, column] == 1 and ours.stats.dominant_ids[row, column] == 0
+    # Its densest point there lies near x + z = 4, where z = 4 / (1 + 1 / 3.6).
+    assert_allclose(ours.median_depth[row, column], 4 / (1 + 1 / 3.6), rtol=0.03)
+    assert theirs.median_depth[row, column] == pytest.approx(ball[2])
 
 
 @pytest.mark.parametrize("buffer_size", [0, -3, 2.5, 4096])

@@ -337,6 +337,7 @@ TABLES = {
     "cuts": GS_ACCEL
     | rows(
         f"{OURS}: the paper's edges are hard, with another gradient",
+        extend__n_curves=1,
         rate__curves=0.01,
         rate__widths=0.0,
         set_width=[[15_000], [30_000]],
@@ -430,6 +431,17 @@ TABLES = {
     ),
     "vr": MINI_SPLATTING2
     | rows(f"{OURS}: in place of StopThePop's queues of tiles, blocks and pixels", render__buffer_size=16),
+    "vr-fine-tuning": {
+        **{name: row for name, row in GS.items() if name.startswith(("photometric", "rate", "adam", "per_extent"))},
+        **rows(
+            "VRSplat, released code: 5,000 more iterations on a finished model, whose number stays",
+            iterations=5_000,
+            sh_degree=(3, 0, 0, 0),
+            rate__means=1.6e-6,
+        ),
+        **rows(f"{OURS}: they concern short runs and few views", min_views=1, short_run_exponent=0.0),
+        **rows(f"{OURS}: in place of StopThePop's queues of tiles, blocks and pixels", render__buffer_size=16),
+    },
 }
 
 CONSTANTS = [
@@ -450,6 +462,7 @@ CONSTANTS = [
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
     ("vr.foveation", "ACUITY_OFFSET", 0.02083333333, "Guenter et al. 2012"),
     ("vr.foveation", "ACUITY_SLOPE", 0.0275, "Guenter et al. 2012"),
+    ("vr.queues", "SIZES", (64, 8, 4), "StopThePop, released code"),
 ]
 
 

@@ -6,24 +6,28 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref import save_ply
+from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.vr import foveation, measures
+from minisplat_ref.extensions.vr import foveation, measures, queues
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
 from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
 from minisplat_ref.extensions.vr.stages import stages
+from minisplat_ref.io.ply import read_label
+from minisplat_ref.mechanisms.tangent.renderer import prepare, render
 from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.reference.hits import blending_order
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Model, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM
 
 CAMERA = make_camera(80, 60, fx=60.0, fy=60.0)
+SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 REQUEST = Request(np.array([0.2, 0.4, 0.6]), backend=REFERENCE)
 
 
@@ -81,6 +85,7 @@ def test_a_pixel_needs_its_block_and_those_around_it():
     is_needed[:], is_needed[2, 3] = False, True
     assert_array_equal(foveation._find_needed_samples(is_needed, 2), [[1, 1, 1, 0]] * 3)
     assert_array_equal(foveation._find_needed_samples(is_needed, 1), is_needed)
+    assert_array_equal(foveation._find_needed_samples(np.zeros((5, 7), bool), 2), np.zeros((3, 4), bool))
 
 
 # --- images ---
@@ -131,6 +136,26 @@ def test_the_fovea_is_drawn_in_full_and_the_rest_is_near(rng):
     assert sum(zone.n_samples for zone in zones) < 0.8 * 80 * 60
 
 
+@pytest.mark.parametrize("size", [(80, 60), (77, 53)])
+def test_zones_are_images_of_cameras_with_larger_pixels(size, rng):
+    """One projection for all zones, and lists of their tiles alone, draw what projecting for each camera draws."""
+    camera, gaze = make_camera(*size, fx=60.0, fy=50.0, rng=rng), Gaze(20, 30, 5.0)
+    model = Model(make_gaussians(rng, 60, size=0.2))
+    image, zones = render_foveated(model, camera, REQUEST, gaze, BUFFER)
+    expected = np.zeros_like(image)
+    for k, weight in enumerate(zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full)):
+        block, n_pairs = 2**k, 0
+        coarse = foveation._coarser(camera, block)
+        low_pass = GSPLAT_MAIN._replace(eps2d=GSPLAT_MAIN.eps2d / block**2)  # of the whole image's pixels
+        output, tape = HEADSET.renderer.render(model, view_from(coarse), REQUEST._replace(conventions=low_pass))
+        expected += weight[:, :, None] * foveation._interpolate(output.image, block, weight.shape)
+        is_needed = foveation._find_needed_samples(weight > 0, block)
+        tiles = foveation._find_needed_tiles(is_needed, tape.bins.grid)
+        n_pairs = int(np.diff(tape.bins.tile_offsets)[tiles].sum())
+        assert zones[k].n_tiles == tiles.sum() > 0 and n_pairs <= zones[k].n_pairs <= 1.3 * n_pairs + 5
+    assert_allclose(image, expected, rtol=0, atol=1e-12)
+
+
 def test_what_is_smooth_is_interpolated_exactly():
     """A plane of light: bilinear between the middles of blocks, wherever four of them lie around."""
     coarse = np.add.outer(np.arange(5.0), 2 * np.arange(7.0))[:, :, None] * np.ones(3)
@@ -167,9 +192,84 @@ def test_a_yaw_does_not_pop(rng):
     assert max(found["tangent planes, exact order"]) < 1e-10 < 1e-3 < max(found["3DGS: EWA, by z"])
 
 
-# --- from end to end ---
+# --- queues ---
 
-SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+
+def test_a_queue_by_hand():
+    """Keys 3 1 2 0 0: a queue of two passes on 1, 2, 0 and 0, then 3; steps are 1, then 1 past the 3, then 1 and 1."""
+    assert queues.pass_queue([3.0, 1.0, 2.0, 0.0, 0.0], 2) == ([1, 2, 3, 4, 0], 4)
+    assert queues.pass_queue([3.0, 1.0, 2.0, 0.0, 0.0], 1) == ([0, 1, 2, 3, 4], 0)
+    assert queues.pass_queue([3.0, 1.0, 2.0, 0.0, 0.0], 9) == ([3, 4, 1, 2, 0], 1 + 1 + 3 + 3)
+    assert queues.pass_queue([], 3) == ([], 0)
+
+
+def line_of_rays(depths, alphas):
+    """G Gaussians on a line of P pixels."""
+    depths, alphas = np.array(depths, float), np.array(alphas, float)
+    n = depths.shape[1]
+    return queues.Rays(alphas > 0, alphas, depths, np.zeros(n, int), np.arange(n))
+
+
+def test_blocks_take_the_depth_where_a_gaussian_is_strongest():
+    """Two Gaussians on four pixels in a row, listed in the wrong order for the block's strongest pixels, 3 and 0.
+
+    The block of four sorts 5 (pixel 3 of the first) before 6 (pixel 0 of the second), that of pixels 0 and 1 sorts 6
+    before 8; pixel 0 has them right, and pixel 3, which the second misses, has one.
+    """
+    rays = line_of_rays([[8, 8, 8, 5], [6, 6, 6, 6]], [[0.1, 0.2, 0.1, 0.9], [0.9, 0.5, 0.1, 0.0]])
+    orders, n_depths, n_steps = queues.order_hits(rays, np.array([1, 0]), ((4, 3),))
+    assert [order.tolist() for order in orders[:1]] == [[0, 1]] and (n_depths, n_steps) == (2, 1)
+    orders, n_depths, n_steps = queues.order_hits(rays, np.array([1, 0]), ((4, 3), (2, 3), (1, 1)))
+    assert [order.tolist() for order in orders] == [[1, 0], [1, 0], [0, 1], [0]]
+    assert (n_depths, n_steps) == (2 + 2 + 2, 1 + 1 + 0)
+
+
+def test_queues_without_limit_are_exact_and_buffers_are_those_of_the_reference(rng):
+    depths, alphas = rng.uniform(1, 2, (30, 16)), rng.uniform(0, 1, (30, 16)) * (rng.uniform(size=(30, 16)) < 0.7)
+    rays = queues.Rays(alphas > 0, alphas, depths, *np.divmod(np.arange(16), 4))
+    for size in (1, 3, EXACT_ORDER):
+        expected = blending_order(rays.is_hit, depths, size)
+        found, _, _ = queues.order_hits(rays, np.arange(30), ((1, size),))
+        for p, order in enumerate(found):
+            assert order.tolist() == [row for row in expected[:, p] if rays.is_hit[row, p]]
+    found, _, _ = queues.order_hits(rays, rng.permutation(30), ((4, 64), (2, 64), (1, 64)))
+    assert all((np.diff(depths[order, p]) >= 0).all() and len(order) for p, order in enumerate(found))
+
+
+def test_the_exact_order_draws_what_the_renderer_draws(rng):
+    """So does the buffer of 16; a hierarchy gets fewer pairs wrong than its list, which is better than one by z."""
+    model = Model(make_gaussians(rng, 150, size=0.4))
+    camera = make_camera(21, 18, fx=20.0, fy=20.0)
+    images, works = queues.draw(prepare(model, camera, REQUEST, None), queues.ORDERS)
+    named = {stages.name: (image, work) for stages, image, work in zip(queues.ORDERS, images, works, strict=True)}
+    for name, buffer_size in (("exact order", None), ("buffer of 16 per pixel", 16)):
+        expected = render(model, view_from(camera), REQUEST, buffer_size=buffer_size)[0].image
+        assert_allclose(named[name][0], expected, atol=1e-12)
+    wrong = [work.n_wrong for work in works]
+    by_z, _, by_tile, hierarchy, *_, exact = wrong
+    assert by_z > by_tile > hierarchy > exact == 0 and wrong[4] > wrong[5] > wrong[6]
+    assert len({(work.n_hits, work.n_pairs) for work in works}) == 1 and works[0].n_depths == works[0].n_steps == 0
+
+
+# --- fine-tuning ---
+
+
+def test_fine_tuning_starts_where_the_model_is_and_keeps_its_number(tmp_path):
+    """Mini-Splatting's own run, then the paper's fine-tuning of it with this renderer."""
+    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
+    train = ["train", str(tmp_path / "nook"), "--test-every", "4"]
+    few, out = tmp_path / "few", tmp_path / "out"
+    assert main([*train, "--recipe", "mini-splatting2", "--iterations", "60", "--out", str(few)]) == 0
+    options = ["--recipe", "vr-fine-tuning", "--init", str(few), "--iterations", "30"]
+    assert main([*train, *options, "--out", str(out)]) == 0
+    before, after = (load_ply(folder / "point_cloud.ply") for folder in (few, out))
+    assert len(before.means) == len(after.means) and 0 < np.abs(before.means - after.means).max() < 0.05
+    assert read_label(out / "point_cloud.ply").extension == "vr"
+    losses = [json.loads(line)["loss"] for line in (out / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < losses[0]
+
+
+# --- from end to end ---
 
 
 def test_trains_renders_and_studies(tmp_path, capsys):
@@ -184,6 +284,9 @@ def test_trains_renders_and_studies(tmp_path, capsys):
     assert main(["study", "vr/foveation", str(scene), *study]) == 0
     rows = json.loads((tmp_path / "study" / "result.json").read_text())["rows"]
     assert rows[0]["n_samples"] > rows[1]["n_samples"] and "weighted PSNR" in capsys.readouterr().out
+    capsys.readouterr()
+    assert main(["study", "vr/queues", "--ply", ply, "--out", str(tmp_path / "queues")]) == 0
+    assert "| queues of 4 x 4, 2 x 2 and pixel" in capsys.readouterr().out
     assert main(["study", "vr/yaw", "--ply", ply, "--steps", "2", "--out", str(tmp_path / "yaw")]) == 0
 
 

@@ -40,9 +40,9 @@ class Case(NamedTuple):
     not_learnt: frozenset[str] = frozenset()
 
 
-def random_cuts(rng, gaussians):
+def random_cuts(rng, gaussians, n_curves=1):
     """Return Gaussians with curves through them, a third with hard edges."""
-    population, n = with_cuts(gaussians, rng), len(gaussians.means)
+    population, n = with_cuts(gaussians, rng, n_curves=n_curves), len(gaussians.means)
     curves = 0.4 * population.curves + 0.2 * rng.normal(size=population.curves.shape)
     return population._replace(curves=curves, widths=np.where(np.arange(n) % 3 == 0, 0.0, 0.7))
 

@@ -48,8 +48,8 @@ def wrong_cut_kernels(monkeypatch):
     right = cut_kernels._records_vjp
 
     def wrong(conic_records_vjp, footprints, v_records):
-        flipped = v_records.copy()
-        flipped[:, cut_kernels.SHIFT : cut_kernels.N_GRADIENTS] *= -1
+        flipped, columns = v_records.copy(), cut_kernels.columns_of(footprints.points.shape[1] // 4)
+        flipped[:, columns.shift : columns.n_gradients] *= -1
         return right(conic_records_vjp, footprints, flipped)
 
     monkeypatch.setattr(cut_kernels, "_records_vjp", wrong)

@@ -14,12 +14,18 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_ply, load_scene
+from minisplat_ref.io.frames import place_scene
 from minisplat_ref.io.ply import COLORS, write_vertices
 from minisplat_ref.methods import RECIPES
+from minisplat_ref.runs.checkpoints import newest_model
 from minisplat_ref.runs.progress import Progress
-from minisplat_ref.runs.start import load_start
+from minisplat_ref.runs.settings import load
+from minisplat_ref.runs.start import load_start, start_from
 from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train as train_state
+from minisplat_ref.training.schedule import configure
 from photo_scenes import write_colmap
 from tolerances import ROUNDED_TO_FLOAT32
 
@@ -207,3 +213,86 @@ def test_compare_starts_all_from_it(scene_folder, dense, tmp_path, capfd, monkey
     assert content["settings"]["init"] == str(dense)
     assert [recipe["mean"]["n_gaussians"] for recipe in content["recipes"]] == [119, 119]
     assert str(dense) in (tmp_path / "out" / "report.html").read_text()
+
+
+# From a run
+
+
+@pytest.fixture(scope="module")
+def few(scene_folder, tmp_path_factory):
+    """A run with the exposures of its photographs."""
+    out = tmp_path_factory.mktemp("runs") / "few"
+    assert train(scene_folder, out, "--recipe", "3dgs-accel", "--iterations", "4", "--set", "exposure=true") == 0
+    return out
+
+
+def scene_of(scene_folder):
+    return place_scene(load_scene(scene_folder, test_every=4))
+
+
+def test_a_run_goes_on_where_it_ended(few, scene_folder):
+    """Every field is that of the result, and so is the exposure; moments begin afresh."""
+    recipe = configure(find_recipe("3dgs", 10), exposure=True)
+    start = start_from(few, scene_of(scene_folder), recipe, 0)
+    saved = newest_model(few, load(few)).model
+    for name, field in start.state.gaussians._asdict().items():
+        assert_array_equal(field, getattr(saved.gaussians, name), err_msg=name)
+    assert saved.shared.keys() == start.state.shared.keys() != set()
+    assert all((start.state.shared[name] == values).all() for name, values in saved.shared.items())
+    assert start.state.step == 0 and not any(moments.any() for moments in start.state.adam.first)
+    assert start.source.endswith("few, trained with 3dgs-accel and rendered by splatting") and start.notices == []
+    before = [field.copy() for field in saved.gaussians]
+    train_state(scene_of(scene_folder), recipe, state=start.state, seed=0)
+    again = newest_model(few, load(few)).model
+    assert all((a == b).all() for a, b in zip(before, again.gaussians, strict=True))  # the run itself stays
+
+
+@pytest.mark.parametrize(
+    ("recipe", "settings", "says"),
+    [
+        ("3dgs", {}, "has parameters exposures besides its Gaussians, which recipe 3dgs does not train: add --set exp"),
+        ("velocity", {}, "which recipe velocity does not train: add --set exposure=true"),
+    ],
+)
+def test_parameters_that_a_recipe_lacks_are_named(few, scene_folder, recipe, settings, says):
+    with pytest.raises(InputError, match=says):
+        start_from(few, scene_of(scene_folder), configure(find_recipe(recipe, 10), **settings), 0)
+
+
+def test_another_number_of_photographs_is_refused(few, scene_folder):
+    scene = place_scene(load_scene(scene_folder, test_every=2))
+    with pytest.raises(InputError, match="give the photographs of that run, divided by the same --test-every"):
+        start_from(few, scene, configure(find_recipe("3dgs", 10), exposure=True), 0)
+
+
+def test_a_run_of_another_place_is_refused(few, scene_folder):
+    scene = scene_of(scene_folder)
+    turned = [
+        view._replace(camera=view.camera._replace(cam_from_world_t=view.camera.cam_from_world_t - [0, 0, 1e3]))
+        for view in scene.train_views
+    ]
+    with pytest.raises(InputError, match=r"no training view sees any of its \d+ Gaussians; give a run of scene nook"):
+        start_from(few, scene._replace(train_views=tuple(turned)), find_recipe("3dgs", 10), 0)
+
+
+def test_from_one_extension_to_another(scene_folder, tmp_path, capfd):
+    """3DGS becomes a moving scene at rest; a moving scene does not become 3DGS, unless as points."""
+    plain, moving, out = (tmp_path / name for name in ("plain", "moving", "out"))
+    assert train(scene_folder, plain, "--recipe", "3dgs", "--iterations", "2") == 0
+    options = ["--recipe", "velocity", "--iterations", "1"]
+    assert train(scene_folder, moving, *options, "--init", str(plain)) == 0
+    said = capfd.readouterr().out
+    assert f"starts from 60 Gaussians of {plain}, trained with 3dgs and rendered by splatting, here by velocity" in said
+    start = load_ply(plain / "point_cloud.ply")
+    population = find_recipe("velocity").representation.population
+    assert 0 < np.abs(load_ply(moving / "point_cloud.ply", population).means - start.means).max() < 1e-2
+    assert train(scene_folder, out, "--recipe", "3dgs", "--iterations", "2", "--init", str(moving)) == 2
+    error = capfd.readouterr().err.strip().splitlines()[-1]
+    assert "holds moving Gaussians with velocities, which recipe 3dgs does not train" in error and not out.exists()
+    assert "give --init" in error and "point_cloud.ply to start from its points alone" in error
+
+
+def test_a_folder_without_a_run_is_refused(scene_folder, tmp_path, capfd):
+    (tmp_path / "empty").mkdir()
+    assert train(scene_folder, tmp_path / "out", "--init", str(tmp_path / "empty")) == 2
+    assert "holds no run, config.json is missing" in capfd.readouterr().err

@@ -14,11 +14,10 @@ from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, INRIA, LIST_ORDER,
 from minisplat_ref.cpu.compositing import hits as plain
 from minisplat_ref.cpu.compositing.exponential import exp_exact
 from minisplat_ref.cpu.compositing.responses import KernelResponse, conic_response
-from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import load, maximum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
-from minisplat_ref.reference import compositing
+from minisplat_ref.reference import compositing, removal
 from minisplat_ref.reference.hits import CONIC, Hit, Response, blending_order, tile_hits
 from minisplat_ref.types import Floats, Ints, Projection, TileGrid
 from scenes import ALL_CONVENTIONS, activated, as_dtype, make_camera, make_gaussians
@@ -426,11 +425,87 @@ def test_bytes_do_not_depend_on_threads(order, rng):
 
 @pytest.mark.parametrize("name", ["composite_hits", "composite_hits_vjp"])
 def test_twins_take_the_same_arguments(name):
-    asked = {"with_stats", "with_median_depth"}  # which the plain kernels do not collect
     of_book, of_kernels = (list(signature(getattr(m, name)).parameters) for m in (compositing, plain))
-    assert [argument for argument in of_book if argument not in asked] == of_kernels
+    assert of_book == of_kernels
 
 
-def test_no_statistics(rng):
-    with pytest.raises(InputError, match="use backend cpu"):
-        PLAIN.composite(*conic_case(rng, 3, np.float64).arguments, with_stats=True)
+def test_plain_statistics_equal_those_of_the_tuned_kernels(rng):
+    case = conic_case(rng, 250, np.float64)
+    got, expected = (
+        backend.composite(*case.arguments, with_stats=True, with_median_depth=True) for backend in (PLAIN, CPU)
+    )
+    assert_array_equal(got.stats.dominant_ids, expected.stats.dominant_ids)
+    assert_array_equal(got.stats.hit_count, expected.stats.hit_count)
+    assert_allclose(got.stats.blend_weight_sum, expected.stats.blend_weight_sum, rtol=1e-10)
+    assert_allclose(got.median_depth, expected.median_depth, rtol=1e-10)
+
+
+# --- statistics ---
+
+
+def statistics(package, response, case):
+    """Blend statistics, median depth, and the squared change without each primitive, from composite_hits' package."""
+    output = package.composite_hits(response, *case.arguments, with_stats=True, with_median_depth=True)
+    domes, colors, _, bins, conventions = case.arguments
+    changes = (removal if package is compositing else package).removal_changes_of_hits(
+        response, domes, colors, bins, conventions, output
+    )
+    return {**output.stats._asdict(), "median_depth": output.median_depth, "changes": changes}
+
+
+@pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
+def test_statistics_of_kernels_equal_those_of_the_reference(order, rng):
+    case = dome_case(rng, 120)
+    expected = statistics(compositing, DOMES._replace(buffer_size=order), case)
+    got = statistics(plain, KERNEL_DOMES._replace(buffer_size=order), case)
+    assert (expected["dominant_ids"] >= 0).mean() > 0.5 and (expected["median_depth"] > 0).mean() > 0.3
+    for name in ("hit_count", "dominant_count", "dominant_ids"):
+        assert_array_equal(got[name], expected[name], err_msg=name)
+        assert got[name].dtype == expected[name].dtype
+    for name in ("blend_weight_sum", "blend_weight_max", "median_depth", "changes"):
+        assert_allclose(got[name], expected[name], rtol=1e-10, atol=PARITY_FLOAT64, err_msg=name)
+
+
+@pytest.mark.parametrize("package", [compositing, plain], ids=["reference", "kernels"])
+def test_statistics_by_hand(package):
+    """Two domes of alpha 1/2 in one pixel; on the ray, the one listed first is the farther.
+
+    In the list's order its weight is 1/2 and the other's 1/4, and it alone takes T to 1/2, which is not below. Sorted,
+    the weights change places, and the second hit, at the depth 3, takes T to 1/4.
+    """
+    domes = Domes(
+        np.array([[0.5, 0.5], [0.5, 0.5]]),
+        np.full(2, 2.0),
+        np.full(2, 0.5),
+        np.array([3.0, 2.0]),
+        np.zeros((2, 2)),
+        np.tile(np.array([[0, 0, 1, 1]], np.int32), (2, 1)),
+    )
+    order_of_list = np.array([1.0, 2.0])
+    bins = REFERENCE.bin_gaussians(
+        Projection(domes.means2d, *[order_of_list] * 4, domes.boxes), TileGrid(1, 1, 16, 16), GSPLAT_MAIN
+    )
+    arguments = domes, np.zeros((2, 3 * N_CHANNELS)), np.ones(N_CHANNELS), bins, GSPLAT_MAIN
+    listed_response = DOMES if package is compositing else KERNEL_DOMES
+    for buffer_size, weights, dominant in ((LIST_ORDER, [0.5, 0.25], 0), (EXACT_ORDER, [0.25, 0.5], 1)):
+        got = statistics(package, listed_response._replace(buffer_size=buffer_size), Case(arguments, ()))
+        assert_allclose(got["blend_weight_sum"], weights, rtol=CLOSED_FORM)
+        assert_allclose(got["blend_weight_max"], weights, rtol=CLOSED_FORM)
+        assert_array_equal(got["hit_count"], [1, 1])
+        assert_array_equal(got["dominant_ids"], [[dominant]])
+        assert_array_equal(got["dominant_count"], np.arange(2) == dominant)
+        assert_allclose(got["median_depth"], [[2.0 if buffer_size == LIST_ORDER else 3.0]], rtol=CLOSED_FORM)
+        # Without either, twice the quarter of the background that is seen: 1/4 more in each of the channels.
+        assert_allclose(got["changes"], 2 * [N_CHANNELS / 16], rtol=CLOSED_FORM)
+
+
+def test_removal_is_what_rendering_without_each_changes(rng):
+    case, response = dome_case(rng, 12), DOMES._replace(buffer_size=EXACT_ORDER)
+    domes, colors, background, bins, conventions = case.arguments
+    open_ended = conventions._replace(transmittance_min=0.0)  # otherwise a pixel could take further hits
+    got = statistics(compositing, response, Case((*case.arguments[:4], open_ended), ()))["changes"]
+    whole = compositing.composite_hits(response, *case.arguments[:4], open_ended).image
+    for g in (0, 5, 11):
+        gone = domes._replace(opacities=np.where(np.arange(12) == g, 0, domes.opacities))
+        image = compositing.composite_hits(response, gone, colors, background, bins, open_ended).image
+        assert_allclose(got[g], np.sum((image - whole) ** 2), rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Blend any primitives: the functions around the plain kernels, twins of those in ``reference.compositing``."""
+"""Blend any primitives: the functions around the plain kernels, twins of the reference's of the same names."""
 
 from typing import Any
 
@@ -7,10 +7,18 @@ import numpy as np
 from minisplat_ref.constants import LIST_ORDER, Conventions
 from minisplat_ref.cpu.compositing.pixel_rows import KernelPrimitives, Lists, Pixels
 from minisplat_ref.cpu.compositing.plain import backward_kernel, forward_kernel
+from minisplat_ref.cpu.compositing.plain_statistics import (
+    HITS,
+    N_NUMBERS,
+    WEIGHT_MAX,
+    WEIGHT_SUM,
+    removal_kernel,
+    statistics_kernel,
+)
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.cpu.compositing.tile_state import frame_of
 from minisplat_ref.jit.compile import kernel, n_threads, prange
-from minisplat_ref.types import BlendGradient, Floats, RenderOutput, TileBins
+from minisplat_ref.types import BlendGradient, BlendStats, Floats, Ints, RenderOutput, TileBins
 
 N_CHUNKS = 64  # of the primitives, when their slots are added up
 
@@ -32,19 +40,40 @@ def composite_hits(
     background: Floats,
     bins: TileBins,
     conventions: Conventions,
+    *,
+    with_stats: bool = False,
+    with_median_depth: bool = False,
 ) -> RenderOutput:
     """Blend the primitives of every tile, front to back; see ``reference.compositing.composite_hits``."""
     height, width, dtype, n_channels = bins.grid.height, bins.grid.width, colors.dtype, len(background)
     image, alpha = np.empty((height, width, n_channels), dtype), np.empty((height, width), dtype)
+    records = KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives))
+    lists, frame = lists_of(bins, response), frame_of(bins, conventions, dtype)
     forward_kernel(_find_shared(response), n_channels)(
-        KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
-        background,
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
-        n_threads(),
-        _pixels(image, alpha, dtype),
+        records, background, lists, frame, n_threads(), _pixels(image, alpha, dtype)
     )
-    return RenderOutput(image, alpha, None, None)
+    if not (with_stats or with_median_depth):
+        return RenderOutput(image, alpha, None, None)
+    pairs, median_depth = np.zeros((len(bins.gaussian_ids), N_NUMBERS), dtype), np.zeros((height, width), dtype)
+    dominant_ids = np.full((height, width), -1, np.int32)
+    statistics_kernel(_find_shared(response))(
+        records, lists, frame, n_threads(), pairs, dominant_ids.reshape(-1), median_depth.reshape(-1, 1)
+    )
+    stats = _blend_stats(pairs, dominant_ids, bins.gaussian_ids, len(colors)) if with_stats else None
+    return RenderOutput(image, alpha, median_depth if with_median_depth else None, stats)
+
+
+def _blend_stats(pairs: Floats, dominant_ids: Ints, ids: Ints, n: int) -> BlendStats:
+    """Return the statistics of n primitives from the numbers of pairs [M, 3], whose primitives are ``ids`` [M]."""
+    largest = np.zeros(n, pairs.dtype)
+    np.maximum.at(largest, ids, pairs[:, WEIGHT_MAX])
+    return BlendStats(
+        np.bincount(ids, pairs[:, WEIGHT_SUM], n).astype(pairs.dtype),
+        largest,
+        np.bincount(ids, pairs[:, HITS], n).astype(np.int32),
+        np.bincount(dominant_ids[dominant_ids >= 0], minlength=n).astype(np.int32),
+        dominant_ids,
+    )
 
 
 def composite_hits_vjp(
@@ -78,6 +107,30 @@ def composite_hits_vjp(
     return BlendGradient(
         response.records_vjp(primitives, v_records), v_colors.astype(dtype), v_background.astype(dtype)
     )
+
+
+def removal_changes_of_hits(
+    response: KernelResponse,
+    primitives: Any,
+    colors: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+) -> Floats:
+    """Return the squared change of the image without each primitive; see ``reference.removal``."""
+    dtype, n_channels = colors.dtype, output.image.shape[2]
+    changes = np.zeros(len(bins.gaussian_ids), dtype)
+    removal_kernel(_find_shared(response), n_channels)(
+        KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
+        lists_of(bins, response),
+        frame_of(bins, conventions, dtype),
+        n_threads(),
+        np.ascontiguousarray(output.image, dtype).reshape(-1, n_channels),
+        changes,
+    )
+    totals = np.zeros(len(colors))
+    np.add.at(totals, bins.gaussian_ids, changes)
+    return totals
 
 
 def lists_of(bins: TileBins, response: KernelResponse) -> Lists:

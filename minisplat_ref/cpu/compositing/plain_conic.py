@@ -9,7 +9,6 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.hits import composite_hits, composite_hits_vjp
 from minisplat_ref.cpu.compositing.responses import KernelResponse, conic_response
-from minisplat_ref.errors import InputError
 from minisplat_ref.types import CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
 
@@ -28,9 +27,16 @@ def composite(
     with_median_depth: bool = False,
 ) -> RenderOutput:
     """Blend every tile's Gaussians front to back; see ``reference.compositing.composite``."""
-    if with_stats or with_median_depth:
-        raise InputError("the plain kernels collect no statistics: use backend cpu or reference")
-    return composite_hits(_response(colors.dtype), projection, colors, background, bins, conventions)
+    return composite_hits(
+        _response(colors.dtype),
+        projection,
+        colors,
+        background,
+        bins,
+        conventions,
+        with_stats=with_stats,
+        with_median_depth=with_median_depth,
+    )
 
 
 def composite_vjp(

@@ -1,35 +1,37 @@
 """Cuts: a Bezier curve in each Gaussian's plane cuts a part of it away, so edges are sharp.
 
 This follows DisC-GS, Qu et al. 2024, arXiv 2405.15196. A Gaussian is smooth, and spills over the edges of what it
-shows. Here each has a cubic curve in the plane of its first two axes
-(:mod:`minisplat_ref.extensions.cuts.response`), and what lies behind it, seen from the centre, is cut away
+shows. Here each has cubic curves in the plane of its first two axes (:mod:`minisplat_ref.extensions.cuts.response`),
+one unless ``n_curves`` says otherwise, and what lies behind one, seen from the centre, is cut away
 (:mod:`minisplat_ref.extensions.cuts.curve`):
 
-    alpha = o exp(-d^T Q d / 2) mask(d),   mask = 1 where the segment from the centre to d crosses the curve an even
-                                                  number of times, else 0
+    alpha = o exp(-d^T Q d / 2) mask(d),   mask = 1 where the segment from the centre to d crosses the curves an
+                                                  even number of times, else 0
 
 A step has no derivative. So training uses ``1 / (1 + exp(-distance / w))`` of the signed distance to the edge of the
 part that is cut away, with its exact gradient; w is 1 pixel at first, then half a pixel, and 0 in the last iteration,
 so what is saved, evaluated and rendered has hard edges. ``widths`` is a column of the PLY.
 
     minisplat-ref train SCENE --recipe cuts
+    minisplat-ref train SCENE --recipe cuts --set n_curves=2
     minisplat-ref study cuts/card --out DIR
+    minisplat-ref study cuts/edge SCENE --out DIR
     minisplat-ref oracle gradients --extension cuts
 
 ``docs/FAMILY.md`` has the measured figures.
 
-This deviates from the paper, which keeps the step and replaces its gradient by an approximation. Each Gaussian has one
-curve here. Control points are in standard deviations instead of world units, and follow the affine map that projects
-the Gaussian, so that its cut rotates and shrinks with it. The curve is a polygon of 8 edges, so that crossings are
-counted without roots of cubics. Where a curve moves across the centre, what was cut away and what was left change
-places, and the image jumps, which no gradient shows. Training does not change which axes are the first two; if a
-Gaussian becomes flat along one of them, its curve is seen edge on.
+This deviates from the paper, which keeps the step and replaces its gradient by an approximation. Control points are in
+standard deviations instead of world units, and follow the affine map that projects the Gaussian, so that its cuts
+rotate and shrink with it. A curve is a polygon of 8 edges, so that crossings are counted without roots of cubics. Where
+a curve moves across the centre, what was cut away and what was left change places, and the image jumps, which no
+gradient shows. Training does not change which axes are the first two; if a Gaussian becomes flat along one of them, its
+curves are seen edge on.
 """
 
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS
 from minisplat_ref.extensions.cuts.stages import stages
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.studies.study import OUT, declare, iterations, seeds
+from minisplat_ref.studies.study import OUT, SCENE, declare, downscale, iterations, seeds
 
 CARD = declare(
     "card",
@@ -37,4 +39,10 @@ CARD = declare(
     f"{__name__}.study.run",
     *(OUT, iterations(300), seeds(4)),
 )
-EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages, studies=(CARD,))
+EDGE = declare(
+    "edge",
+    "a real edge, in a window of a photograph, with no, one and two curves per Gaussian",
+    f"{__name__}.edge.run",
+    *(SCENE, downscale(), OUT, iterations(300), seeds(3)),
+)
+EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages, studies=(CARD, EDGE))

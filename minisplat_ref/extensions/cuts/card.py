@@ -1,4 +1,4 @@
-"""The study ``cuts/card``: images with one sharp edge, drawn by few Gaussians with and without cuts."""
+"""Images with a sharp edge, drawn by few Gaussians with and without cuts: targets, trainings, measures."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,15 +27,15 @@ class Target(NamedTuple):
 
     image: Floats
     """[H, W, 3] in [0, 1]."""
-    edge: Callable[[Floats], Floats]
-    """x of the edge in px, for y in px."""
+    band: Bools
+    """[H, W] True near the edge."""
 
-    @property
-    def band(self) -> Bools:
-        """[H, W] True near the edge."""
-        ys, xs = np.mgrid[:SIZE, :SIZE] + 0.5
-        near: Bools = np.abs(xs - self.edge(ys)) < BAND
-        return near
+
+def near_edge(edge: Callable[[Floats], Floats]) -> Bools:
+    """Return which pixels lie near an edge at ``x = edge(y)``, px."""
+    ys, xs = np.mgrid[:SIZE, :SIZE] + 0.5
+    near: Bools = np.abs(xs - edge(ys)) < BAND
+    return near
 
 
 def place_cards(n: int, rng: np.random.Generator) -> Gaussians:
@@ -60,7 +60,7 @@ def cut_gaussian() -> Target:
     bright = one._replace(opacity_logits=np.full(1, 3, np.float32), sh_dc=np.ones((1, 3), np.float32))
     hard = CutGaussians(*bright, curves=points, widths=np.zeros(1, np.float32))
     edge = SIZE / 2 + 0.4 * float(np.exp(one.log_scales[0, 0])) * FOCAL / DISTANCE
-    return Target(render_card(hard).astype(np.float64), lambda ys: np.full_like(ys, edge))
+    return Target(render_card(hard).astype(np.float64), near_edge(lambda ys: np.full_like(ys, edge)))
 
 
 def card() -> Target:
@@ -71,7 +71,7 @@ def card() -> Target:
 
     ys, xs = np.mgrid[:SIZE, :SIZE] + 0.5
     covered = np.clip(edge(ys) - xs + 0.5, 0, 1)
-    return Target(np.repeat(BRIGHT * covered[:, :, None], 3, axis=2), edge)
+    return Target(np.repeat(BRIGHT * covered[:, :, None], 3, axis=2), near_edge(edge))
 
 
 def representation_of(population: Any) -> Representation:
@@ -87,14 +87,16 @@ def render_card(population: Any) -> Floats:
     return image
 
 
-def fit_card(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> Any:
-    """Return n Gaussians with or without cuts, trained on the target without density control."""
+def fit_card(target: Target, n: int, n_curves: int, iterations: int, seed: int) -> Any:
+    """Return n Gaussians with ``n_curves`` curves each, 0 for 3DGS, trained on the target without density control."""
     rng = np.random.default_rng(seed)
     view = View("card", CAMERA, np.rint(255 * np.clip(target.image, 0, 1)).astype(np.uint8), None)
     none = np.zeros((0, 3))
     scene = Scene("card", number_views([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
-    population: Any = with_cuts(place_cards(n, rng), rng) if is_cut else place_cards(n, rng)
-    events = tuple(event for event in CUTS.events if is_cut and action_name(event) == set_width.__name__)
+    population: Any = place_cards(n, rng)
+    if n_curves:
+        population = with_cuts(population, rng, n_curves=n_curves)
+    events = tuple(event for event in CUTS.events if n_curves and action_name(event) == set_width.__name__)
     recipe = CUTS._replace(events=events, sh_degree=0, representation=representation_of(population))
     state = TrainState(population, zero_moments(population), step=0, view_order=[], rng=rng, stats={})
     return train(scene, scale_recipe(recipe, iterations), seed=seed, state=state).gaussians
@@ -118,13 +120,17 @@ def edge_width(image: Floats) -> float:
     return float(np.mean(widths))
 
 
-def measure_card(target: Target, population: Any) -> dict[str, float]:
-    """Return the PSNR of the image, of the band around the edge and of the rest, dB, and the edge's width, px."""
-    image = render_card(population)
-    band = target.band
+def measure_parts(target: Target, population: Any) -> dict[str, float]:
+    """Return the PSNR of the image, of the band around the edge and of the rest, dB."""
+    image, band = render_card(population), target.band
     return {
         "psnr": psnr_of(image, target.image),
         "band": psnr_of(image[band], target.image[band]),
         "elsewhere": psnr_of(image[~band], target.image[~band]),
-        "edge_width": edge_width(np.clip(image, 0, 1)),
     }
+
+
+def measure_card(target: Target, population: Any) -> dict[str, float]:
+    """Return what :func:`measure_parts` does, and the edge's width, px."""
+    width = edge_width(np.clip(render_card(population), 0, 1))
+    return {**measure_parts(target, population), "edge_width": width}

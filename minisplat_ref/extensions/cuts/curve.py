@@ -1,10 +1,10 @@
-"""A Bezier curve as a polygon: the side on which a pixel lies, and its distance, in NumPy (DisC-GS, 2405.15196).
+"""Bezier curves as polygons: the side on which a pixel lies, and its distance, in NumPy (DisC-GS, 2405.15196).
 
 The cubic B(t) of four control points P_j, in pixels from the Gaussian's centre, is drawn as ``N_EDGES`` edges between
-``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of edges,
-so the part that is cut away is the shadow of the curve with a lamp at the centre. The shadow is bounded by the curve
-and by two rays, on which its ends B(0) and B(1) move away from the centre. With the nearest point q of these
-N_EDGES + 2 pieces::
+``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of edges
+of all M curves. So one curve cuts its shadow away, with a lamp at the centre, and where the shadows of two overlap, the
+pixel is visible again. A shadow is bounded by the curve and by two rays, on which its ends B(0) and B(1) move away from
+the centre. With the nearest point q of these M (N_EDGES + 2) pieces::
 
     o_i = sum_j a_ij P_j,  u_i = sum_j b_ij P_j       a piece runs from o_i along u_i: an edge once, a ray for ever
     f_i = clip((d - o_i) . u_i / u_i . u_i, 0, top_i),  q = o_i + f_i u_i of the piece where |d - q| is least
@@ -35,14 +35,20 @@ ENDS = np.eye(N_POINTS)[[0, -1]]  # [2, 4] of B(0) and B(1)
 ORIGINS = np.concatenate([VERTICES[:-1], ENDS])  # [N_EDGES + 2, 4] a
 DIRECTIONS = np.concatenate([np.diff(VERTICES, axis=0), ENDS])  # b
 TOPS = np.concatenate([np.ones(N_EDGES), np.full(2, 1e9)])  # largest f
+N_PIECES = len(TOPS)  # of a curve
+
+
+def of_curves(weights: Floats, n: int) -> Floats:
+    """Return weights [K, 4] of one curve's points as those [n K, 4 n] of n curves, each of its own four."""
+    return np.kron(np.eye(n), weights)
 
 
 class Cut(NamedTuple):
-    """The positions of P pixels relative to G curves."""
+    """The positions of P pixels relative to the curves of G Gaussians."""
 
     is_visible: Bools  # [G, P]
     away: Floats  # [G, P, 2] d - q, px
-    pieces: Ints  # [G, P] the nearest
+    pieces: Ints  # [G, P] the nearest, curve by curve
     fractions: Floats  # [G, P] f of it
     masks: Floats  # [G, P]
 
@@ -52,18 +58,21 @@ def evaluate_cuts(points: Floats, widths: Floats, offsets: Floats) -> Cut:
 
     Parameters
     ----------
-    points : ndarray of shape (G, 4, 2)
-        Control points, px from the centre.
+    points : ndarray of shape (G, 4 M, 2)
+        Control points of M curves, one after the other, px from the centre.
     widths : ndarray of shape (G,)
         w, px.
     offsets : ndarray of shape (G, P, 2)
         d, the pixels' positions relative to the centre, px.
     """
-    dtype = points.dtype
-    o, u = (np.einsum("ij,gjk->gik", weights.astype(dtype), points)[:, None] for weights in (ORIGINS, DIRECTIONS))
+    dtype, n = points.dtype, points.shape[1] // N_POINTS
+    o, u = (
+        np.einsum("ij,gjk->gik", of_curves(weights, n).astype(dtype), points)[:, None]
+        for weights in (ORIGINS, DIRECTIONS)
+    )
     d = offsets[:, :, None]  # [G, P, 1, 2]
     f = np.sum((d - o) * u, axis=3) / np.maximum(np.sum(u * u, axis=3), dtype.type(LENGTH_MIN))
-    f = np.clip(f, 0, TOPS.astype(dtype))  # [G, P, pieces]
+    f = np.clip(f, 0, np.tile(TOPS, n).astype(dtype))  # [G, P, pieces]
     away = d - o - f[..., None] * u
     pieces = np.argmin(np.sum(away**2, axis=3), axis=2)[:, :, None]  # [G, P, 1] the first of equals
     nearest = np.take_along_axis(away, pieces[..., None], axis=2)[:, :, 0]
@@ -83,22 +92,23 @@ def _masks(distances: Floats, widths: Floats) -> Floats:
 
 
 def n_crossings(points: Floats, offsets: Floats) -> Ints:
-    """Return how many edges [G, P] the segments from the centre to pixels cross.
+    """Return how many edges [G, P] of all curves the segments from the centre to pixels cross.
 
     An edge is crossed if its ends lie on different sides of the line through centre and pixel, and centre and pixel on
     different sides of the edge. Zero counts as negative, so a line through a vertex crosses one of its two edges, or
     both or none.
     """
-    V = np.einsum("ij,gjk->gik", VERTICES.astype(points.dtype), points)[:, None]  # [G, 1, N_EDGES + 1, 2]
-    d = offsets[:, :, None]
-    is_left = _cross(d, V) > 0  # [G, P, N_EDGES + 1]
-    o, u = V[:, :, :-1], np.diff(V, axis=2)
+    curves = points.reshape(len(points), points.shape[1] // N_POINTS, N_POINTS, 2)  # [G, M, 4, 2]
+    V = np.einsum("ij,gmjk->gmik", VERTICES.astype(points.dtype), curves)[:, None]  # [G, 1, M, N_EDGES + 1, 2]
+    d = offsets[:, :, None, None]
+    is_left = _cross(d, V) > 0  # [G, P, M, N_EDGES + 1]
+    o, u = V[:, :, :, :-1], np.diff(V, axis=3)
     is_beyond = (_cross(u, d - o) > 0) != (_cross(u, -o) > 0)
-    return np.sum((is_left[:, :, 1:] != is_left[:, :, :-1]) & is_beyond, axis=2)
+    return np.sum((is_left[..., 1:] != is_left[..., :-1]) & is_beyond, axis=(2, 3))
 
 
 def evaluate_cuts_vjp(points: Floats, widths: Floats, found: Cut, v_masks: Floats) -> tuple[Floats, Floats]:
-    """Gradient of :func:`evaluate_cuts` with respect to control points [G, 4, 2] and offsets [G, P, 2].
+    """Gradient of :func:`evaluate_cuts` with respect to control points [G, 4 M, 2] and offsets [G, P, 2].
 
     At the nearest point a displacement along its piece does not change the distance, so f counts as fixed. With the
     unit vector e along d - q, along which the distance grows where the pixel is visible::
@@ -112,7 +122,9 @@ def evaluate_cuts_vjp(points: Floats, widths: Floats, found: Cut, v_masks: Float
     v_distances = np.where(is_soft & found.is_visible, v_distances, np.where(is_soft, -v_distances, 0))
     lengths = np.linalg.norm(found.away, axis=2)
     v_offsets = (v_distances / np.where(lengths > 0, lengths, 1))[:, :, None] * found.away
-    weights = ORIGINS[found.pieces] + found.fractions[:, :, None] * DIRECTIONS[found.pieces]  # [G, P, 4]
+    n = points.shape[1] // N_POINTS
+    origins, directions = (of_curves(weights, n)[found.pieces] for weights in (ORIGINS, DIRECTIONS))
+    weights = origins + found.fractions[:, :, None] * directions  # [G, P, 4 M]
     return -np.einsum("gpj,gpk->gjk", weights.astype(points.dtype), v_offsets), v_offsets
 
 

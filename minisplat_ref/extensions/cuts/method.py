@@ -1,21 +1,24 @@
 """The population of Gaussians with cuts, its renderer, and the recipe that trains it."""
 
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cuts.curve import N_POINTS
 from minisplat_ref.extensions.cuts.kernels import response_for
 from minisplat_ref.extensions.cuts.response import RESPONSE, CutFootprints, image_points, image_points_vjp
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import At
 from minisplat_ref.training.state import Iteration, TrainState
-from minisplat_ref.types import Floats, Gaussians
+from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
 
+N_CURVES_MAX = 4  # of a Gaussian: kernels are compiled for each number
 START = 1.0  # initial distance of a curve from the centre, in standard deviations; farther out it would learn nothing
 REACH = 3.0  # initial half-length of a curve, in standard deviations
 WIDTH = 1.0  # px, of masks at the start of a training
@@ -31,21 +34,29 @@ class CutGaussians(NamedTuple):
     sh_dc: Floats
     sh_rest: Floats
     curves: Floats
-    """[N, 8] control points of a cubic, in standard deviations along the Gaussian's first two axes, point by point."""
+    """[N, 8 M] control points of M cubics, in standard deviations along the first two axes, point by point."""
     widths: Floats
     """[N] width of the mask in the image, px; 0 makes a hard edge. Events set it; it is not trained."""
 
 
-def with_cuts(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
-    """Return Gaussians, each with a straight curve on one side of its centre in a random direction."""
+def with_cuts(gaussians: Gaussians, rng: np.random.Generator, *, n_curves: int = 1) -> CutGaussians:
+    """Return Gaussians, each with straight curves on sides of its centre: one in a random direction, others around it.
+
+    Raises
+    ------
+    InputError
+        The number of curves is not from 1 to ``N_CURVES_MAX``.
+    """
+    if not 1 <= n_curves <= N_CURVES_MAX:
+        raise InputError(f"n_curves is {n_curves}: give 1 to {N_CURVES_MAX} curves per Gaussian")
     n, dtype = len(gaussians.means), gaussians.means.dtype
-    angles = rng.uniform(0, 2 * np.pi, n)
-    outwards = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]  # [N, 1, 2]
+    angles = rng.uniform(0, 2 * np.pi, n)[:, None] + 2 * np.pi / n_curves * np.arange(n_curves)  # [N, M]
+    outwards = np.stack([np.cos(angles), np.sin(angles)], axis=2)[:, :, None]  # [N, M, 1, 2]
     across = outwards[..., ::-1] * [-1, 1]
-    curves = START * outwards + np.linspace(-REACH, REACH, N_POINTS)[:, None] * across  # [N, 4, 2]
+    curves = START * outwards + np.linspace(-REACH, REACH, N_POINTS)[:, None] * across  # [N, M, 4, 2]
     return CutGaussians(
         **{name: getattr(gaussians, name) for name in Gaussians._fields},
-        curves=curves.reshape(n, 2 * N_POINTS).astype(dtype),
+        curves=curves.reshape(n, 2 * N_POINTS * n_curves).astype(dtype),
         widths=np.full(n, WIDTH, dtype),
     )
 
@@ -56,7 +67,7 @@ def _is_plain(gaussians: CutGaussians) -> bool:
 
 def _footprints(projected: Projected) -> CutFootprints:
     g, rows = projected.gaussians, projected.rows
-    points = np.zeros((len(g.curves), N_POINTS, 2), g.means.dtype)
+    points = np.zeros((len(g.curves), g.curves.shape[1] // 2, 2), g.means.dtype)
     points[rows] = image_points(g.curves[rows], projected.of(rows), projected.camera, projected.conventions)
     return CutFootprints(projected.projection, points, g.widths)
 
@@ -76,7 +87,28 @@ def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradi
     return PayloadGradient(fields, v_means, v_quats, v_scales, v_seen.cam_from_world_R, v_seen.cam_from_world_t)
 
 
-PAYLOAD = Payload("Gaussians with cuts", RESPONSE, response_for, _is_plain, _footprints, _footprints_vjp)
+@cache
+def _renderer_of(n_curves: int) -> Renderer:
+    response = partial(response_for, n_curves)
+    payload = Payload("Gaussians with cuts", RESPONSE, response, _is_plain, _footprints, _footprints_vjp)
+    return payload_renderer("cuts", payload)
+
+
+def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+    """Render a view with as many curves as the Gaussians have; see :mod:`minisplat_ref.mechanisms.payload.renderer`.
+
+    Raises
+    ------
+    InputError
+        The columns of the curves are not whole curves, or something is wanted that this renderer does not collect.
+    """
+    n_curves, rest = divmod(model.gaussians.curves.shape[1], 2 * N_POINTS)
+    if rest or n_curves > N_CURVES_MAX:
+        raise InputError(
+            f"curves have {model.gaussians.curves.shape[1]} numbers per Gaussian: {2 * N_POINTS} for each of up to"
+            f" {N_CURVES_MAX} curves are drawn"
+        )
+    return _renderer_of(n_curves).render(model, view, request)
 
 
 def set_width(state: TrainState, iteration: Iteration, *, width: float) -> None:
@@ -88,8 +120,8 @@ def set_width(state: TrainState, iteration: Iteration, *, width: float) -> None:
 CUT_GAUSSIANS = Representation(
     "Gaussians with cuts",
     population=CutGaussians,
-    extend=with_cuts,
-    renderer=payload_renderer("cuts", PAYLOAD),
+    extend=partial(with_cuts, n_curves=1),
+    renderer=Renderer("cuts", render, _renderer_of(1).render_vjp, SPLATTING.channels),
     rates=Rates({"curves": 1e-2, "widths": 0.0}, frozenset()),
 )
 

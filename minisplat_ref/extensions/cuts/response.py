@@ -1,4 +1,4 @@
-"""The response of a Gaussian with a cut, in NumPy: the curve in its plane is mapped to the image as its footprint is.
+"""The response of a Gaussian with cuts, in NumPy: curves in its plane are mapped to the image as its footprint is.
 
 Control points are c_j along the first two axes of R, in units of the first two standard deviations. The affine map that
 makes the Gaussian an ellipse in the image, with ``x = R_c mu + t`` and J of :mod:`minisplat_ref.reference.pinhole`,
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.cuts.curve import N_POINTS, Cut, evaluate_cuts, evaluate_cuts_vjp
+from minisplat_ref.extensions.cuts.curve import Cut, evaluate_cuts, evaluate_cuts_vjp
 from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response
@@ -28,25 +28,25 @@ from minisplat_ref.types import Camera, Floats, Ints, Primitives
 
 
 def image_points(curves: Floats, primitives: Primitives, camera: Camera, conventions: Conventions) -> Floats:
-    """Return the control points [N, 4, 2] in pixels from the centres.
+    """Return the control points [N, 4 M, 2] in pixels from the centres.
 
     Parameters
     ----------
-    curves : ndarray of shape (N, 8)
-        c_j, point by point.
+    curves : ndarray of shape (N, 8 M)
+        c_j of M curves, point by point.
     primitives : Primitives
         N Gaussians in front of the camera.
     camera, conventions
         As for the projection.
     """
     *_, M = _maps(primitives, camera, conventions)
-    return np.einsum("nik,njk->nji", M, curves.reshape(-1, N_POINTS, 2))
+    return np.einsum("nik,njk->nji", M, _by_points(curves))
 
 
 class PointsGradient(NamedTuple):
     """Gradient of the loss with respect to everything that :func:`image_points` depends on."""
 
-    curves: Floats  # [N, 8]
+    curves: Floats  # [N, 8 M]
     means: Floats  # [N, 3]
     quats: Floats  # [N, 4]
     scales: Floats  # [N, 3]
@@ -69,7 +69,7 @@ def image_points_vjp(
     x, R, J, M = _maps(primitives, camera, conventions)
     R_c, _ = pose(camera, means.dtype)
     G = (R_c @ R)[:, :, :2]
-    v_M = np.einsum("nji,njk->nik", v_points, curves.reshape(-1, N_POINTS, 2))  # [N, 2, 2]
+    v_M = np.einsum("nji,njk->nik", v_points, _by_points(curves))  # [N, 2, 2]
     v_J = np.einsum("nik,nlk,nk->nil", v_M, G, scales[:, :2])
     v_GS = np.einsum("nil,nik->nlk", J, v_M)  # [N, 3, 2]
     v_G, v_scales = np.zeros_like(R), np.zeros_like(scales)
@@ -87,6 +87,11 @@ def image_points_vjp(
     )
 
 
+def _by_points(curves: Floats) -> Floats:
+    """Return [N, 8 M] numbers as points [N, 4 M, 2]."""
+    return curves.reshape(len(curves), curves.shape[1] // 2, 2)
+
+
 def _maps(primitives: Primitives, camera: Camera, conventions: Conventions) -> tuple[Floats, Floats, Floats, Floats]:
     """Return x [N, 3], R [N, 3, 3], J [N, 2, 3] and the first two columns of M [N, 2, 2]."""
     means, quats, scales, _ = primitives
@@ -102,7 +107,7 @@ class CutFootprints(Footprints):
     """The footprints of Gaussians with cuts."""
 
     points: Floats
-    """[N, 4, 2] control points, px from the centre."""
+    """[N, 4 M, 2] control points of M curves, px from the centre."""
     widths: Floats
     """[N] w of the mask, px."""
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.cuts.curve import N_EDGES, TOPS
+from minisplat_ref.extensions.cuts.curve import N_EDGES, N_PIECES, TOPS
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.mechanisms.payload.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
@@ -13,21 +13,21 @@ from minisplat_ref.types import Floats, Gaussians
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer as a stage; the reference finds which hits count, and which part of a curve is nearest."""
+    """Return the renderer of two curves as a stage; the reference finds which hits count, and what is nearest."""
     return (renderer_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
 
 
 def _near(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
     """Return Gaussians whose curves pass through their bright parts; otherwise little would depend on them."""
-    population = with_cuts(gaussians, rng)
+    population = with_cuts(gaussians, rng, n_curves=2)
     return population._replace(curves=0.4 * population.curves)
 
 
 def _sides(tile: TileHits, colors: Floats) -> tuple[np.ndarray, ...]:
     """Return which hits count, which are clamped, and the nearest vertex or, numbered after the vertices, piece."""
     is_hit, found = tile.alphas > 0, tile.hit.place.cut
-    edges = np.arange(N_EDGES)
+    edges, (curves, pieces) = np.arange(N_EDGES), np.divmod(found.pieces, N_PIECES)
     first, last = np.array([*edges, 0, N_EDGES]), np.array([*edges + 1, 0, N_EDGES])  # vertices of each piece
-    nearest = np.where(found.fractions > 0, N_EDGES + 1 + found.pieces, first[found.pieces])
-    nearest = np.where(found.fractions < TOPS[found.pieces], nearest, last[found.pieces])
-    return is_hit, tile.is_clamped, np.where(is_hit, nearest, -1)
+    nearest = np.where(found.fractions > 0, N_EDGES + 1 + pieces, first[pieces])
+    nearest = np.where(found.fractions < TOPS[pieces], nearest, last[pieces])
+    return is_hit, tile.is_clamped, np.where(is_hit, nearest, -1), np.where(is_hit, curves, -1)

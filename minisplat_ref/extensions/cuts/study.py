@@ -38,7 +38,7 @@ def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[
     jobs = [(name, kind, n) for name in targets for kind, numbers in NUMBERS.items() for n in numbers]
     rows, images = [], {name: [("target", target.image)] for name, target in targets.items()}
     for name, kind, n in kit.with_progress(jobs, "trainings"):
-        found = [card.fit_card(targets[name], n, kind == "cut", iterations, seed) for seed in range(n_seeds)]
+        found = [card.fit_card(targets[name], n, int(kind == "cut"), iterations, seed) for seed in range(n_seeds)]
         measures = [card.measure_card(targets[name], population) for population in found]
         images[name].append((f"{n} {kind}", card.render_card(found[0])))
         row = {"image": name, "kind": kind, "n_gaussians": n, "n_floats": n * N_FLOATS[kind]}

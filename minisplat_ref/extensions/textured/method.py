@@ -9,7 +9,8 @@ from minisplat_ref.extensions.textured.population import TexturedGaussians, blan
 from minisplat_ref.extensions.textured.reference import visible_frames, visible_frames_vjp
 from minisplat_ref.extensions.textured.response import RESPONSE, TexturedFootprints, bounds
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
-from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
+from minisplat_ref.methods.gaussian_splatting import FINE_TUNING as GS_FINE_TUNING
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation
@@ -88,10 +89,11 @@ TEXTURED_GAUSSIANS = Representation(
 TEXTURED = GS_ACCEL._replace(name="textured")
 """The recipe ``textured``: 3DGS with textures from the first iteration on."""
 
-_LAST = GS.learning_rates.change(**GS.learning_rates.at(GS.iterations, extent=1.0))  # means at their last rate
-
-FINE_TUNING = GS._replace(name="textured-fine-tuning", learning_rates=_LAST, events=(), sh_milestones=(0, 0, 0))
+FINE_TUNING = GS_FINE_TUNING._replace(name="textured-fine-tuning")
 """Fine-tuning as released: of a finished run only the number of Gaussians stays."""
 
-FROZEN = FINE_TUNING._replace(name="textured-frozen", learning_rates=_LAST.change(means=0.0, quats=0.0, log_scales=0.0))
+FROZEN = FINE_TUNING._replace(
+    name="textured-frozen",
+    learning_rates=FINE_TUNING.learning_rates.change(means=0.0, quats=0.0, log_scales=0.0),
+)
 """Fine-tuning as in the paper's text: opacities, colours and textures are trained, and nothing else changes."""

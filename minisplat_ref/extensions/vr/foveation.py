@@ -10,17 +10,23 @@ Where MAR has doubled, one ray for each block of 2 x 2 pixels is enough, and whe
 These coarse images are drawn through the centres of the blocks with the same footprints, low-pass included, and only
 in the tiles that need them. They are interpolated between the centres, and blended with the finer image in a ring
 where a zone begins.
+
+A footprint on its tangent plane does not depend on the pixels, so each Gaussian is projected and shaded once for all
+zones, and one sort of the keys (zone, tile, distance) makes their lists. A tile has as many rays in every zone, so one
+of blocks of 4 x 4 pixels covers 16 times the area.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.tangent.renderer import prepare
-from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.mechanisms.tangent.planes import TangentFootprints
+from minisplat_ref.mechanisms.tangent.renderer import Prepared, prepare
+from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
 from minisplat_ref.rendering import Request
-from minisplat_ref.types import Bools, Camera, Floats, Model, TileBins
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, TileBins, TileGrid
 
 ACUITY_OFFSET, ACUITY_SLOPE = 1 / 48, 0.0275  # degrees, and degrees per degree
 N_ZONES = 3  # blocks of 1, 2 and 4 pixels per side
@@ -36,6 +42,19 @@ class Gaze(NamedTuple):
     """Pixels."""
     full: float
     """Eccentricity up to which every pixel is drawn, degrees."""
+
+
+class Sampling(NamedTuple):
+    """The rays of a zone."""
+
+    block: int
+    """Pixels per side of the block of one ray."""
+    camera: Camera
+    """Its pixels are the blocks; those at the edges may extend beyond the image."""
+    grid: TileGrid
+    """The tiles of its image."""
+    is_needed: Bools
+    """[n_tiles] which of them hold a ray that is needed."""
 
 
 class Zone(NamedTuple):
@@ -135,23 +154,91 @@ def render_foveated(
         The gaze lies outside the image.
     """
     check_gaze(gaze, camera)
-    weights = zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full)
+    conventions = request.conventions._replace(uses_principal_point=True)
+    camera = with_principal_point(camera, request.conventions)
+    weights, begins = zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full), zone_begins(gaze.full)
+    tile = request.backend.tile_width, request.backend.tile_height
+    samplings = [_sample(camera, weight > 0, 2**k, tile) for k, weight in enumerate(weights)]
+    # The coarsest blocks may extend beyond the image, and so may what is projected.
+    coarsest = samplings[-1]
+    width, height = coarsest.block * coarsest.camera.width, coarsest.block * coarsest.camera.height
+    all_blocks = camera._replace(width=width, height=height)
+    prepared = prepare(model, all_blocks, request._replace(conventions=conventions), buffer_size)
+    lists = bin_zones(prepared.footprints, samplings)
+
     image, zones = np.zeros((camera.height, camera.width, 3), model.gaussians.means.dtype), []
-    for k, (weight, begins) in enumerate(zip(weights, zone_begins(gaze.full), strict=True)):
-        block = 2**k
-        conventions = request.conventions._replace(eps2d=request.conventions.eps2d / block**2)
-        coarse = _coarser(camera, block)
-        is_needed = _find_needed_samples(weight > 0, block)
-        if not is_needed.any():
-            zones.append(Zone(block, begins, 0, 0, 0))
-            continue
-        prepared = prepare(model, coarse, request._replace(conventions=conventions), buffer_size)
-        bins = prepared.listed()
-        tiles = _find_needed_tiles(is_needed, bins)
-        kept = _keep_tiles(bins, tiles)
-        image += weight[:, :, None] * _interpolate(prepared.blended(kept).image, block, weight.shape)
-        zones.append(Zone(block, begins, int(tiles.sum()), _n_pixels(tiles, bins), len(kept.gaussian_ids)))
+    for sampling, bins, weight, begin in zip(samplings, lists, weights, begins, strict=True):
+        if sampling.is_needed.any():
+            coarse = _draw(prepared, sampling, bins)
+            image += weight[:, :, None] * _interpolate(coarse, sampling.block, weight.shape)
+        n_tiles, n_rays = int(sampling.is_needed.sum()), _n_pixels(sampling.is_needed, sampling.grid)
+        zones.append(Zone(sampling.block, begin, n_tiles, n_rays, len(bins.gaussian_ids)))
     return image, zones
+
+
+def bin_zones(footprints: TangentFootprints, samplings: Sequence[Sampling]) -> list[TileBins]:
+    """List the Gaussians of every tile that is needed, of all zones with one sort; the other tiles' lists are empty.
+
+    The lists suffice for drawing, not for differentiating.
+    """
+    offsets = np.cumsum([0, *(len(sampling.is_needed) for sampling in samplings)])  # of a zone's tiles among all
+    pairs = [_pairs_of(footprints.boxes, sampling) for sampling in samplings]
+    ids = np.concatenate([of_zone[0] for of_zone in pairs])
+    tiles = np.concatenate([of_zone[1] + offset for of_zone, offset in zip(pairs, offsets, strict=False)])
+    order = np.lexsort((ids, footprints.distances[ids], tiles))
+    ids, starts = ids[order].astype(np.int32), np.searchsorted(tiles[order], np.arange(offsets[-1] + 1))
+    lists = []
+    for k, sampling in enumerate(samplings):
+        of_tiles = starts[offsets[k] : offsets[k + 1] + 1]
+        own = ids[of_tiles[0] : of_tiles[-1]]
+        n_of_each = np.append(0, np.cumsum(np.bincount(own, minlength=len(footprints.radii))))
+        lists.append(
+            TileBins(own, of_tiles - of_tiles[0], np.arange(len(own), dtype=np.int32), n_of_each, sampling.grid)
+        )
+    return lists
+
+
+def _pairs_of(boxes: Ints, sampling: Sampling) -> tuple[Ints, Ints]:
+    """Return Gaussian and tile of each pair [M] of a zone, for the tiles that are needed."""
+    grid, (x0, y0, x1, y1) = sampling.grid, _in_blocks(boxes, sampling).astype(np.int64).T
+    left, top = x0 // grid.tile_width, y0 // grid.tile_height
+    right, bottom = -(-x1 // grid.tile_width), -(-y1 // grid.tile_height)
+    needed = sampling.is_needed.reshape(grid.n_tiles_y, grid.n_tiles_x)
+    before = np.pad(needed.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))  # needed tiles above and to the left
+    n_needed = before[bottom, right] - before[top, right] - before[bottom, left] + before[top, left]
+    rows = np.flatnonzero((x1 > x0) & (y1 > y0) & (n_needed > 0))
+    n_x, n_pairs = (right - left)[rows], ((right - left) * (bottom - top))[rows]
+    of_row = np.repeat(np.arange(len(rows)), n_pairs)
+    k = np.arange(len(of_row)) - np.repeat(np.cumsum(n_pairs) - n_pairs, n_pairs)  # 0, 1, ... within a Gaussian
+    down, along = np.divmod(k, n_x[of_row])
+    tiles = (top[rows][of_row] + down) * grid.n_tiles_x + left[rows][of_row] + along
+    is_kept = sampling.is_needed[tiles]
+    return rows[of_row[is_kept]], tiles[is_kept]
+
+
+def _in_blocks(boxes: Ints, sampling: Sampling) -> Ints:
+    """Return boxes of pixels as boxes [N, 4] of the blocks that they touch, in the zone's image."""
+    block, size = sampling.block, np.array(2 * [sampling.grid.width, sampling.grid.height])
+    touched = np.concatenate([boxes[:, :2] // block, -(-boxes[:, 2:] // block)], axis=1)
+    return np.minimum(touched, size).astype(np.int32)
+
+
+def _draw(prepared: Prepared, sampling: Sampling, bins: TileBins) -> Floats:
+    """Return the image [H, W, 3] of a zone; what is not listed there is not even looked at."""
+    rows = np.unique(bins.gaussian_ids)
+    fields = {name: field[rows] for name, field in prepared.footprints._asdict().items() if name != "camera"}
+    fields["boxes"] = _in_blocks(fields["boxes"], sampling)
+    listed = prepared._replace(
+        footprints=TangentFootprints(**fields, camera=sampling.camera), channels=prepared.channels[rows]
+    )
+    return listed.blended(bins._replace(gaussian_ids=np.searchsorted(rows, bins.gaussian_ids).astype(np.int32))).image
+
+
+def _sample(camera: Camera, is_needed: Bools, block: int, tile: tuple[int, int]) -> Sampling:
+    """Return the rays of a zone whose pixels [H, W] are ``is_needed``."""
+    coarse = _coarser(camera, block)
+    grid = TileGrid(coarse.width, coarse.height, *tile)
+    return Sampling(block, coarse, grid, _find_needed_tiles(_find_needed_samples(is_needed, block), grid))
 
 
 def _coarser(camera: Camera, block: int) -> Camera:
@@ -168,8 +255,8 @@ def _coarser(camera: Camera, block: int) -> Camera:
 
 def _find_needed_samples(is_needed: Bools, block: int) -> Bools:
     """Return which samples are needed: those of the blocks of needed pixels, and their neighbours for interpolation."""
-    if block == 1:
-        return is_needed
+    if block == 1 or not is_needed.any():
+        return is_needed[::block, ::block]
     height, width = (-(-n // block) for n in is_needed.shape)
     padded = np.zeros((height * block, width * block), bool)
     padded[: is_needed.shape[0], : is_needed.shape[1]] = is_needed
@@ -178,26 +265,17 @@ def _find_needed_samples(is_needed: Bools, block: int) -> Bools:
     return np.logical_or.reduce(shifted)
 
 
-def _find_needed_tiles(is_needed: Bools, bins: TileBins) -> Bools:
+def _find_needed_tiles(is_needed: Bools, grid: TileGrid) -> Bools:
     """Return which tiles [n_tiles] hold a sample that is needed."""
-    grid = bins.grid
     ys, xs = np.nonzero(is_needed)
     tiles = np.zeros(grid.n_tiles_x * grid.n_tiles_y, bool)
     tiles[ys // grid.tile_height * grid.n_tiles_x + xs // grid.tile_width] = True
     return tiles
 
 
-def _keep_tiles(bins: TileBins, is_kept: Bools) -> TileBins:
-    """Return the lists with those of other tiles empty; this suffices for drawing, not for differentiating."""
-    counts = np.diff(bins.tile_offsets)
-    offsets = np.concatenate([[0], np.cumsum(np.where(is_kept, counts, 0))])
-    pairs = np.repeat(is_kept, counts)
-    return bins._replace(gaussian_ids=bins.gaussian_ids[pairs], tile_offsets=offsets, slots=bins.slots[pairs])
-
-
-def _n_pixels(tiles: Bools, bins: TileBins) -> int:
+def _n_pixels(tiles: Bools, grid: TileGrid) -> int:
     """Return how many pixels of the image lie in tiles."""
-    grid, total = bins.grid, 0
+    total = 0
     for tile in np.flatnonzero(tiles):
         y, x = divmod(int(tile), grid.n_tiles_x)
         total += min(grid.tile_width, grid.width - x * grid.tile_width) * min(

@@ -1,4 +1,4 @@
-"""The measurements of the studies ``vr/foveation`` and ``vr/yaw``."""
+"""The measurements of the studies ``vr/foveation``, ``vr/queues`` and ``vr/yaw``."""
 
 import argparse
 import statistics
@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from minisplat_ref.backends import CPU
+from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.extensions.vr import queues
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
 from minisplat_ref.io import load_ply
 from minisplat_ref.mechanisms.tangent.rays import color_changes, ewa_hits, tangent_hits, yaw_camera
+from minisplat_ref.mechanisms.tangent.renderer import prepare
 from minisplat_ref.rendering import Request, activate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, RED
@@ -186,4 +188,45 @@ def draw_yaw(found: dict[str, list[float]], half_angle: float) -> Figure:
         )
     axes.set(title="Largest colour change of a fixed ray per step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
     axes.legend()
+    return figure
+
+
+def run_queues(args: argparse.Namespace) -> kit.Report:
+    """Order the hits of the first test view of a run in several ways."""
+    gaussians, camera = kit.read_run(args.ply)
+    wide = Gaussians._make(field.astype(np.float64) for field in gaussians)
+    prepared = prepare(Model(wide), camera, Request(backend=REFERENCE), None)
+    images, works = queues.draw(prepared, queues.ORDERS)
+    exact, rows = images[-1], []
+    for stages, image, work in zip(queues.ORDERS, images, works, strict=True):
+        largest = float(np.abs(image - exact).max())
+        psnr = None if stages is queues.EXACT else kit.psnr_of(image, exact)
+        rows.append({"order": stages.name, **work._asdict(), "psnr": psnr, "largest": largest})
+    table = [
+        [
+            row["order"],
+            *(f"{row[key] / row['n_hits']:.2f}" for key in ("n_depths", "n_steps")),
+            f"{100 * row['n_wrong'] / max(row['n_pairs'], 1):.3f}",
+            "" if row["psnr"] is None else f"{row['psnr']:.1f}",
+            f"{255 * row['largest']:.1f}",
+        ]
+        for row in rows
+    ]
+    heading = ["order", "depths per hit", "steps per hit", "wrong pairs (%)", "PSNR (dB)", "largest error (levels)"]
+    n, n_hits = len(wide.means), rows[0]["n_hits"]
+    text = f"{n:,} Gaussians, {camera.width} x {camera.height} pixels, {n_hits / exact[..., 0].size:.1f} hits per pixel"
+    text += ", against exact order\n\n" + markdown_table(heading, table)
+    return kit.Report({"gaussians": n, "rows": rows}, draw_orders(rows), text)
+
+
+def draw_orders(rows: list[dict[str, Any]]) -> Figure:
+    """Draw the pairs in the wrong order against the work."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    for i, row in enumerate(rows):
+        x, y = (row["n_depths"] + row["n_steps"]) / row["n_hits"], row["n_wrong"] / max(row["n_pairs"], 1)
+        axes.plot(x, y, "o", color=RED if row["order"] == queues.HIERARCHY.name else BLUE)
+        axes.annotate(row["order"], (x, y), fontsize=8, xytext=(6, 8 - 8 * (i % 3)), textcoords="offset points")
+    axes.set_yscale("symlog", linthresh=1e-5)
+    axes.set(title="Pairs of hits in the wrong order", xlabel="depths and steps of insertion, per hit", ylabel="share")
     return figure

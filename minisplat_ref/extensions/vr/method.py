@@ -1,8 +1,9 @@
-"""Mini-Splatting on tangent planes: the representation and the recipe."""
+"""Mini-Splatting on tangent planes: the representation and the recipes."""
 
 from functools import partial
 
 from minisplat_ref.mechanisms.tangent.renderer import render, render_vjp
+from minisplat_ref.methods.gaussian_splatting import FINE_TUNING
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.training.representation import Representation
@@ -15,4 +16,7 @@ HEADSET = Representation(
 )
 
 VR = MINI_SPLATTING2._replace(name="vr")
-"""The recipe ``vr``: Mini-Splatting2 on tangent planes; importance is that of 3DGS's footprints."""
+"""The recipe ``vr``: Mini-Splatting2 on tangent planes, from the first iteration to the last."""
+
+VR_FINE_TUNING = FINE_TUNING._replace(name="vr-fine-tuning", iterations=5_000)
+"""The recipe ``vr-fine-tuning``: a finished Mini-Splatting model gets used to its new footprints, as in the paper."""

@@ -42,7 +42,7 @@ from minisplat_ref.types import (
     View,
 )
 
-BY_REFERENCE = frozenset({"stats", "median_depth"})  # what the plain kernels do not collect
+KNOWN = frozenset({"depth", "stats", "median_depth"})  # what can be wanted
 
 
 class Projected(NamedTuple):
@@ -159,10 +159,10 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     if payload.is_plain(g):
         return SPLATTING.render(model, view, request)
     backend, conventions, dtype, camera = request.backend, request.conventions, g.means.dtype, view.camera
-    missing = request.wants - {"depth"} - (frozenset() if backend.is_compiled else BY_REFERENCE)
-    if missing:
-        way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
-        raise InputError(f"{payload.plural} are drawn without {', '.join(sorted(missing))}: {way_out}")
+    if missing := request.wants - KNOWN:
+        raise InputError(
+            f"{payload.plural} are drawn without {', '.join(sorted(missing))}: train a recipe that does without"
+        )
     sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
@@ -178,13 +178,13 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(listed, grid, conventions)
     blended = footprints, payload.coefficients(projected, channels), background, bins
-    if backend.is_compiled:
-        output = kernel_hits.composite_hits(payload.response_for(dtype), *blended, conventions)
-    else:
-        with_stats, with_median_depth = "stats" in request.wants, "median_depth" in request.wants
-        output = composite_hits(
-            payload.response, *blended, conventions, with_stats=with_stats, with_median_depth=with_median_depth
-        )
+    blend = (
+        partial(kernel_hits.composite_hits, payload.response_for(dtype))
+        if backend.is_compiled
+        else partial(composite_hits, payload.response)
+    )
+    with_stats, with_median_depth = "stats" in request.wants, "median_depth" in request.wants
+    output = blend(*blended, conventions, with_stats=with_stats, with_median_depth=with_median_depth)
     output = output._replace(visible_ids=np.flatnonzero(listed.radii[:, 0] > 0), n_pairs=len(bins.gaussian_ids))
     return output, PayloadTape(payload, projected, sh_degree, blended, output)
 

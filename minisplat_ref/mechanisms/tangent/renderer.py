@@ -1,5 +1,6 @@
 """A renderer of footprints on tangent planes, in which each pixel has its own order, and its gradient."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,8 @@ from minisplat_ref.mechanisms.tangent.planes import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activate, choose_degree, parameters_vjp
+from minisplat_ref.reference.removal import removal_changes_of_hits
+from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -34,8 +36,8 @@ from minisplat_ref.types import (
 )
 
 BUFFER_MAX = 1024  # hits; for more, use None
-STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth", "removal_changes"})
-"""Computed with 3DGS's footprints."""
+OF_STATS = frozenset({"stats", "surface", "dominant_depth"})
+"""What needs blend statistics."""
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
 """The response of the reference, in the order of the list unless ``buffer_size`` is set."""
@@ -64,12 +66,24 @@ class Prepared(NamedTuple):
         by_distance = Projection(zeros[:, :2], f.distances, zeros, f.opacities, f.radii, f.boxes)
         return REFERENCE.bin_gaussians(by_distance, grid, self.conventions)
 
-    def blended(self, bins: TileBins) -> RenderOutput:
-        """Return the image, drawn by kernels or by the reference."""
+    def blended(self, bins: TileBins, wants: frozenset[str] = frozenset()) -> RenderOutput:
+        """Return the image, drawn by kernels or by the reference, and the statistics that are wanted."""
         inputs = self.footprints, self.channels, self.background, bins, self.conventions
+        blend = (
+            partial(kernel_hits.composite_hits, response_for(self.channels.dtype, self.buffer_size))
+            if self.backend.is_compiled
+            else partial(composite_hits, RESPONSE._replace(buffer_size=self.buffer_size))
+        )
+        return blend(*inputs, with_stats=bool(wants & OF_STATS), with_median_depth="median_depth" in wants)
+
+    def removal_changes(self, bins: TileBins, output: RenderOutput) -> Floats:
+        """Return the squared change of the colours [N] without each Gaussian."""
+        assert not self.has_depth, "a channel of depths has another unit"
+        inputs = self.footprints, self.channels, bins, self.conventions, output
         if self.backend.is_compiled:
-            return kernel_hits.composite_hits(response_for(self.channels.dtype, self.buffer_size), *inputs)
-        return composite_hits(RESPONSE._replace(buffer_size=self.buffer_size), *inputs)
+            response = response_for(self.channels.dtype, self.buffer_size)
+            return kernel_hits.removal_changes_of_hits(response, *inputs)
+        return removal_changes_of_hits(RESPONSE._replace(buffer_size=self.buffer_size), *inputs)
 
 
 class Tape(NamedTuple):
@@ -136,8 +150,8 @@ def check_buffer_size(buffer_size: int | None) -> int:
 def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:
     """Render a view; return the image and a tape.
 
-    Statistics of blending, surfaces and median depths, which the kernels do not collect, are those of 3DGS's footprints
-    in its order.
+    Statistics of blending and of removal are those of the pixels' own order; a median depth is where on the ray the
+    Gaussian is densest, and so is a point of ``surface``, that of the dominant Gaussian.
 
     Parameters
     ----------
@@ -152,13 +166,29 @@ def render(model: Model, view: View, request: Request, *, buffer_size: int | Non
     """
     prepared = prepare(model, view.camera, request, buffer_size)
     bins = prepared.listed()
-    blended = prepared.blended(bins)
+    blended = prepared.blended(bins, request.wants)
     visible_ids = np.flatnonzero(prepared.footprints.radii[:, 0] > 0)
-    output = blended._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids))
-    if asked := request.wants & STATISTICS:
-        splatted, _ = SPLATTING.render(model, view, request._replace(wants=asked))
-        output = output._replace(stats=splatted.stats, median_depth=splatted.median_depth, extras=splatted.extras)
+    extras = _extras(prepared, bins, blended, request)
+    output = blended._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids), extras=extras)
     return output, Tape(prepared, bins, blended)
+
+
+def _extras(p: Prepared, bins: TileBins, output: RenderOutput, request: Request) -> dict[str, Any]:
+    """Return what the request wants by name besides channels and statistics."""
+    extras: dict[str, Any] = {}
+    if output.stats is not None:
+        dominant_ids = output.stats.dominant_ids
+        if "surface" in request.wants:
+            means, quats, scales, _ = p.primitives
+            extras["surface"] = p.backend.surface_points(means, quats, scales, p.footprints.camera, dominant_ids)
+        if "dominant_depth" in request.wants:
+            extras["dominant_depth"] = np.append(p.footprints.depths, 0)[dominant_ids].astype(p.channels.dtype)
+    if "removal_changes" in request.wants:
+        lit = output
+        if request.behind is not None:
+            lit = output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
+        extras["removal_changes"] = p.removal_changes(bins, lit)
+    return extras
 
 
 def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
