@@ -49,6 +49,14 @@ def test_distinctiveness_by_hand(rng):
         assert_allclose(local_distinctiveness(means[rows], colors[rows]), expected[rows], atol=CLOSED_FORM)
 
 
+def test_neighbours_are_found_in_the_box_of_the_centres():
+    """In a box of 8 x 1, the upper half is behind the whole lower one; in a cube, x alone would decide."""
+    means = np.array([[0.0, 0, 0], [0.0, 1, 0], [2.0, 0, 0], [8.0, 1, 0]])
+    gray = np.array([0.0, 10.0, 1.0, 13.0])  # in the order of the box: 0, 1, 10, 13; of the cube: 0, 10, 1, 13
+    colors = np.repeat(gray[:, None], 3, axis=1)
+    assert_allclose(local_distinctiveness(means, colors), [2.0, 12.0, 10.0, 6.0], rtol=CLOSED_FORM)
+
+
 def test_distinctiveness_is_the_mean_of_the_channels():
     colors = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, -3.0]])
     assert_allclose(local_distinctiveness(np.eye(3)[:2], colors), [4.0, 4.0], rtol=CLOSED_FORM)
