@@ -30,6 +30,8 @@ rows are sorted already; here it is the inverse.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.omg.file import OMG_FILE
 from minisplat_ref.extensions.omg.method import OMG
+from minisplat_ref.extensions.omg.population import load_plain, save_plain, with_features
+from minisplat_ref.extensions.omg.renderer import COMPACT
 from minisplat_ref.studies.study import declare, fine_tune, trainings
 
 DISTINCTIVENESS = declare(
@@ -39,5 +41,15 @@ DISTINCTIVENESS = declare(
     *trainings(1000, "mini-splatting2"),
     fine_tune(200),
 )
-EXTENSION = Extension("omg", recipes=(OMG,), formats=(OMG_FILE,), studies=(DISTINCTIVENESS,))
+EXTENSION = Extension(
+    "omg",
+    recipes=(OMG,),
+    representation=COMPACT,
+    save=save_plain,
+    load=load_plain,
+    saves_plain=True,
+    sample=with_features,
+    formats=(OMG_FILE,),
+    studies=(DISTINCTIVENESS,),
+)
 """The recipe ``omg``, the format ``.omg`` and a study."""

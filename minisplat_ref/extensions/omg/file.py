@@ -25,7 +25,7 @@ import numpy as np
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
-from minisplat_ref.extensions.omg.svq import Quantised, quantise
+from minisplat_ref.extensions.omg.svq import QUAT_MIN, Quantised, quantise, unit_quats
 from minisplat_ref.io.formats import Format
 from minisplat_ref.mechanisms.packing.container import (
     WAY_OUT,
@@ -48,7 +48,6 @@ GAUSSIANS_MAX = 2**31 - 1
 CODES_MAX = 2**16
 LARGEST_HALF = 65504.0
 FARTHEST = 1e30  # distance of a scene's median from the origin along an axis
-QUAT_MIN = 2.0**-10  # replaces w in a code (w, x) of zero, since (y, z) may be zero, too
 
 
 class Sizes(NamedTuple):
@@ -103,10 +102,9 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     _halves(harmonics, "sh_rest")
     decoder = fit_decoder(harmonics, sizes.n_features)
     features = features_of(harmonics, decoder)
-    quats = rows.quats / np.linalg.norm(rows.quats, axis=1, keepdims=True)
     vectors = {
         "scales": rows.log_scales,
-        "rotations": quats * np.where(quats[:, :1] < 0, -1.0, 1.0),
+        "rotations": unit_quats(rows.quats),
         "opacities": rows.opacity_logits[:, None],
         "appearance": np.concatenate([rows.sh_dc, features, np.zeros((n, (3 + features.shape[1]) % 2))], axis=1),
     }
