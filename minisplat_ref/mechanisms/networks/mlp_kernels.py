@@ -1,11 +1,11 @@
 """The multilayer perceptron of :mod:`.mlp` as kernels: the same functions, compiled.
 
 Rows are taken in blocks that stay in the cache through all layers, forward and back; the forward pass is computed again
-for the gradient instead of stored. Widths are padded with zeros to whole lanes, which changes nothing: the ReLU of 0
+for the gradient instead of stored. Widths are padded with zeros to multiples of 16. That changes nothing: the ReLU of 0
 is 0, and so is the product of anything with a weight of 0.
 
-All three products are sums of four rows by eight columns at a time, in a fixed order. The gradient of the weights is a
-sum over rows, in ``N_CHUNKS`` chunks whatever the number of threads, which are then added one after the other.
+All three products are sums of four rows by sixteen columns at a time, in a fixed order. The gradient of the weights is
+a sum over rows, in ``N_CHUNKS`` chunks whatever the number of threads, which are then added one after the other.
 """
 
 from typing import Any, NamedTuple
@@ -18,13 +18,14 @@ from minisplat_ref.types import Floats, Ints
 
 N_CHUNKS = 32
 BLOCK = 64  # rows, a multiple of 4
+COLUMNS = 2 * WIDTH  # two lanes: with four rows, as many sums as keep both multipliers busy
 
 
 class Padded(NamedTuple):
     """A network as flat arrays."""
 
     widths: Ints
-    """[L + 1] numbers per row before and after each layer, multiples of ``WIDTH``."""
+    """[L + 1] numbers per row before and after each layer, multiples of ``COLUMNS``."""
     weights: Floats
     """All W_l [widths[l], widths[l + 1]], one after the other."""
     transposed: Floats
@@ -45,32 +46,41 @@ class Matrix(NamedTuple):
 
 
 @scalar
+def _add_to_row(sums, number, lanes):
+    """Return two sums, each with a number times its lanes added."""
+    return sums[0] + number * lanes[0], sums[1] + number * lanes[1]
+
+
+@scalar
 def _add_product(
     out,  # Matrix [M, N], whose column stride is 1
     left,  # Matrix [M, K]
     right,  # Matrix [K, N], whose column stride is 1
-    shape,  # M, a multiple of 4; K; N, a multiple of WIDTH
+    shape,  # M, a multiple of 4; K; N, a multiple of COLUMNS
 ):
     """Add ``left right`` to ``out``; each entry is a sum over k in ascending order."""
     m, n_inner, n = shape
     a, b, c = left.numbers, right.numbers, out.numbers
     for i in range(0, m, 4):
         first = left.start + i * left.row
-        for j in range(0, n, WIDTH):
-            at = out.start + i * out.row + j
-            sum0, sum1 = load(c, at), load(c, at + out.row)
-            sum2, sum3 = load(c, at + 2 * out.row), load(c, at + 3 * out.row)
+        for j in range(0, n, COLUMNS):
+            at0 = out.start + i * out.row + j
+            at1, at2, at3 = at0 + out.row, at0 + 2 * out.row, at0 + 3 * out.row
+            row0 = load(c, at0), load(c, at0 + WIDTH)
+            row1 = load(c, at1), load(c, at1 + WIDTH)
+            row2 = load(c, at2), load(c, at2 + WIDTH)
+            row3 = load(c, at3), load(c, at3 + WIDTH)
             for k in range(n_inner):
-                lanes = load(b, right.start + k * right.row + j)
-                place = first + k * left.column
-                sum0 = sum0 + a[place] * lanes
-                sum1 = sum1 + a[place + left.row] * lanes
-                sum2 = sum2 + a[place + 2 * left.row] * lanes
-                sum3 = sum3 + a[place + 3 * left.row] * lanes
-            store(c, at, sum0)
-            store(c, at + out.row, sum1)
-            store(c, at + 2 * out.row, sum2)
-            store(c, at + 3 * out.row, sum3)
+                place, of_right = first + k * left.column, right.start + k * right.row + j
+                lanes = load(b, of_right), load(b, of_right + WIDTH)
+                row0 = _add_to_row(row0, a[place], lanes)
+                row1 = _add_to_row(row1, a[place + left.row], lanes)
+                row2 = _add_to_row(row2, a[place + 2 * left.row], lanes)
+                row3 = _add_to_row(row3, a[place + 3 * left.row], lanes)
+            store(c, at0, row0)
+            store(c, at1, row1)
+            store(c, at2, row2)
+            store(c, at3, row3)
 
 
 @scalar
@@ -213,7 +223,7 @@ def _sum_in_order(parts: Floats) -> Floats:
 def _padded(network: Any, slope: float) -> Padded:
     shapes = [layer.weights.shape for layer in network]
     widths = np.array([shapes[0][0], *(shape[1] for shape in shapes)])
-    widths = -(-widths // WIDTH) * WIDTH
+    widths = -(-widths // COLUMNS) * COLUMNS
     weights, transposed, biases = [], [], []
     for k, layer in enumerate(network):
         whole = np.zeros((widths[k], widths[k + 1]), layer.weights.dtype)
