@@ -42,23 +42,27 @@ from minisplat_ref.extensions.omg.population import load_plain, save_plain, with
 from minisplat_ref.extensions.omg.renderer import COMPACT
 from minisplat_ref.extensions.omg.stages import stages
 from minisplat_ref.studies.study import (
+    CONTINUES,
     OUT,
+    PLY,
+    RESUMED_OUT,
+    SEEDS,
     argument,
     declare,
     downscale,
     fine_tune,
     iterations,
+    recipe,
     scene,
     seeds,
-    trainings,
 )
 
 DISTINCTIVENESS = declare(
     "distinctiveness",
     "which 50, 25 and 12.5 % of the Gaussians to keep",
     f"{__name__}.study.run",
-    *trainings(1000, "mini-splatting2"),
-    fine_tune(200),
+    *(scene(), RESUMED_OUT, downscale(), recipe("mini-splatting2"), iterations(1000), PLY, SEEDS, fine_tune(200)),
+    description=f"Which 50, 25 and 12.5 % of the Gaussians to keep. {CONTINUES}",
 )
 FILES = declare(
     "files",

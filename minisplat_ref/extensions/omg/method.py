@@ -5,11 +5,12 @@ from functools import partial
 
 import numpy as np
 
-from minisplat_ref.extensions.omg.decoding import SLOPE, encode_places
+from minisplat_ref.extensions.omg.decoding import SLOPE
 from minisplat_ref.extensions.omg.population import (
     CODEBOOKS,
     COLOR,
     HARMONICS,
+    N_SPACE,
     N_STATIC,
     N_VIEW,
     OPACITY,
@@ -66,27 +67,24 @@ def prune_indistinct(
 def start_networks(state: TrainState, iteration: Iteration) -> None:
     """Replace opacity and colour by features: static ones that are the colours, and view features of zero.
 
-    The networks begin with the outputs that the Gaussians had, as far as a linear map of random hidden layers can
-    have them: only the last layers are fitted. The paper does not say how its networks begin.
+    The networks begin with the outputs that the Gaussians had, as nearly as their last layers can be fitted, and
+    without an influence of the place. The paper does not say how its networks begin.
     """
-    g, dtype = state.gaussians, state.gaussians.means.dtype
-    features = np.concatenate([g.sh_dc, np.zeros((n_rows(g), N_VIEW), dtype)], axis=1)
-    space = forward(
-        from_shared(SPACE, state.shared),
-        encode_places(g.means, state.shared, networks_for(iteration.render_settings.backend)),
-        SLOPE,
-    )[0]
-    n_rest = g.sh_rest.shape[1]
-    targets = {
-        COLOR: (features[:, :N_STATIC], g.sh_dc),
-        OPACITY: (features[:, :N_STATIC], g.opacity_logits[:, None]),
-        HARMONICS: (features[:, N_STATIC:], g.sh_rest.reshape(len(features), 3 * n_rest)),
-    }
-    for name, (own, target) in targets.items():
-        hidden = forward(from_shared(name, state.shared), np.concatenate([own, space], axis=1), SLOPE)[1][1]
-        last = fit_last_layer(hidden, target)
-        state.shared[f"{name}_weights_1"][:, : target.shape[1]] = last.weights
-        state.shared[f"{name}_biases_1"][: target.shape[1]] = last.biases
+    g, n = state.gaussians, n_rows(state.gaussians)
+    features = np.concatenate([g.sh_dc, np.zeros((n, N_VIEW), g.means.dtype)], axis=1)
+    for array in from_shared(SPACE, state.shared)[1]:
+        array[:] = 0
+    space = np.zeros((n, N_SPACE), g.means.dtype)
+    static, view = (np.concatenate([own, space], axis=1) for own in np.split(features, [N_STATIC], axis=1))
+    for name, inputs, target in (
+        (COLOR, static, g.sh_dc),
+        (OPACITY, static, g.opacity_logits[:, None]),
+        (HARMONICS, view, g.sh_rest.reshape(n, 3 * g.sh_rest.shape[1])),
+    ):
+        network = from_shared(name, state.shared)
+        last = fit_last_layer(forward(network, inputs, SLOPE)[1][1], target)
+        network[1].weights[:, : target.shape[1]] = last.weights
+        network[1].biases[: target.shape[1]] = last.biases
     state.gaussians = g._replace(features=features)
     state.adam = state.adam._replace(
         first=state.adam.first._replace(features=np.zeros_like(features)),

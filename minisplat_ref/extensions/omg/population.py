@@ -77,8 +77,9 @@ def load_plain(path: str | Path, population: Any) -> Gaussians:
 
 
 def initial_shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
-    """Return random networks, empty codebooks, and the place of the scene, float32."""
+    """Return random networks, empty codebooks, and the place of the scene, float32; ``rng`` itself draws nothing."""
     shared: dict[str, Floats] = {}
+    (rng,) = rng.spawn(1)  # so that until there are features, a training is that of Mini-Splatting
     for name, sizes in SIZES.items():
         shared |= to_shared(name, make_network(sizes, rng))
     shared |= {name: np.zeros(shape) for name, shape in CODEBOOKS.items()}
