@@ -11,7 +11,7 @@ import numpy as np
 
 from minisplat_ref.bench.interleaving import time_interleaved
 from minisplat_ref.mechanisms.networks import hash_grid
-from minisplat_ref.mechanisms.networks.mlp import make_network
+from minisplat_ref.mechanisms.networks.mlp import Layer, make_network
 from minisplat_ref.mechanisms.networks.networks import COMPILED, IN_NUMPY, Networks
 from minisplat_ref.oracle.cases import Case
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
@@ -97,7 +97,7 @@ def _works(dtype: type[np.floating]) -> list[Work]:
 
 
 def _network(sizes: tuple[int, ...], rng: np.random.Generator, dtype: type[np.floating]) -> Work:
-    network = tuple(layer._make(array.astype(dtype) for array in layer) for layer in make_network(sizes, rng))
+    network = tuple(Layer(*(array.astype(dtype) for array in layer)) for layer in make_network(sizes, rng))
     x = rng.normal(size=(N_ROWS, sizes[0])).astype(dtype)
     v_y = rng.normal(size=(N_ROWS, sizes[-1])).astype(dtype)
     tapes = {id(networks): networks.forward(network, x)[1] for networks in (IN_NUMPY, COMPILED)}

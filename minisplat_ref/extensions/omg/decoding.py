@@ -29,7 +29,7 @@ from minisplat_ref.extensions.omg.population import (
     OmgGaussians,
 )
 from minisplat_ref.mechanisms.networks.contraction import contract
-from minisplat_ref.mechanisms.networks.mlp import Network, from_shared, to_shared
+from minisplat_ref.mechanisms.networks.mlp import Layer, Network, from_shared, to_shared
 from minisplat_ref.mechanisms.networks.networks import Networks
 from minisplat_ref.types import Floats, Ints
 
@@ -107,7 +107,7 @@ def run_networks_vjp(
 def _network(name: str, shared: Shared, like: Floats) -> Network:
     """Return a network in the dtype of an array."""
     network = from_shared(name, shared)
-    return tuple(layer._make(array.astype(like.dtype, copy=False) for array in layer) for layer in network)
+    return tuple(Layer(*(array.astype(like.dtype, copy=False) for array in layer)) for layer in network)
 
 
 def gather(codebooks: Floats, indices: Ints) -> Floats:
@@ -133,8 +133,8 @@ def gather_vjp(codebooks: Floats, indices: Ints, v_vectors: Floats) -> Floats:
 
 def split_codes(codes: Floats, shared: Shared, names: tuple[str, ...]) -> dict[str, Ints]:
     """Return the columns of the codes by the names of their codebooks; empty where there are no columns."""
-    found, begin = {}, 0
-    rows = np.rint(codes).astype(np.int64)
+    found: dict[str, Ints] = {}
+    begin, rows = 0, np.rint(codes).astype(np.int64)
     for name in names if codes.shape[1] else ():
         found[name] = rows[:, begin : begin + len(shared[name])]
         begin += len(shared[name])

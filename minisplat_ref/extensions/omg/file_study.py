@@ -32,13 +32,13 @@ COLORS = {".msz": BLUE, ".spz": GREY, ".omg": OCHRE, TRAINED: RED}
 def run(args: argparse.Namespace) -> kit.Report:
     """Train, or read checkpoints, and measure every file."""
     scene = kit.read_scene(args.scene, args.downscale)
-    runs = []
+    runs: list[dict[str, Any]] = []
     for name, (model, frame) in _trainings(args, scene):
         rows = kit.with_progress(_rows(model, frame, scene), f"files, {name}")
         runs.append({"training": name, "gaussians": len(model.gaussians.means), "rows": list(rows)})
     origin = {"checkpoints": [str(path) for path in args.checkpoints]} if args.checkpoints else {"recipe": OMG.name}
     result = {**kit.describe_scene(scene), **origin, "iterations": args.iterations, "runs": runs}
-    counts = with_deviation([of["gaussians"] for of in runs], 0)
+    counts = with_deviation([float(of["gaussians"]) for of in runs], 0)
     text = f"{kit.title(result)}\n{counts} Gaussians\n\n"
     text += markdown_table(["file", "bytes", "bytes per Gaussian", "PSNR (dB)", "lost (dB)"], _table(runs))
     return kit.Report(result, draw(result), text)

@@ -32,7 +32,7 @@ from minisplat_ref.methods.mini_splatting import (
     restart_from_means,
 )
 from minisplat_ref.strategy import importance
-from minisplat_ref.strategy.ops import keep, n_rows
+from minisplat_ref.strategy.ops import contiguous, keep, n_rows
 from minisplat_ref.training.schedule import At, During, Event, does
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Floats
@@ -164,7 +164,7 @@ def round_centres(state: TrainState, iteration: Iteration) -> None:
 def write_fields(state: TrainState, iteration: Iteration) -> None:
     """Write into the fields of 3DGS what networks and codebooks make of features and codes, for files."""
     decoded, _ = decode(state.model, networks_for(iteration.render_settings.backend))
-    state.gaussians = decoded._make(np.ascontiguousarray(field) for field in decoded)
+    state.gaussians = contiguous(decoded)
 
 
 _prune = partial(prune_indistinct, metric=importance.indoor, distinct_mass=MASS, distinct_power=POWER)

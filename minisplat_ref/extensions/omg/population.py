@@ -55,7 +55,8 @@ class OmgGaussians(NamedTuple):
 def without_features(gaussians: Gaussians, rng: np.random.Generator) -> OmgGaussians:
     """Return the Gaussians as those of 3DGS."""
     nothing = np.zeros((len(gaussians.means), 0), gaussians.means.dtype)
-    return OmgGaussians(*gaussians[: len(Gaussians._fields)], features=nothing, codes=nothing.copy())
+    fields = {name: getattr(gaussians, name) for name in Gaussians._fields}
+    return OmgGaussians(**fields, features=nothing, codes=nothing.copy())
 
 
 def with_features(gaussians: Gaussians, rng: np.random.Generator) -> OmgGaussians:

@@ -65,7 +65,7 @@ def decode_vjp(tape: Tape, v: OmgGaussians) -> tuple[OmgGaussians, dict[str, Flo
 
     What networks and codebooks replace gets zeros: it is not read.
     """
-    shared, v_shared = tape.model.shared, {}
+    shared, v_shared = tape.model.shared, dict[str, Floats]()
     if tape.decoded is not None:
         n, n_rest = v.sh_rest.shape[:2]
         v_harmonics = np.zeros_like(tape.decoded.harmonics)

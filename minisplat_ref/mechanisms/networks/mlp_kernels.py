@@ -232,8 +232,9 @@ def _padded(network: Any, slope: float) -> Padded:
         transposed.append(whole.T.ravel())
         biases.append(np.pad(layer.biases, (0, widths[k + 1] - shapes[k][1])))
     dtype = network[0].weights.dtype
-    arrays = (np.concatenate(of_layers) for of_layers in (weights, transposed, biases))
-    return Padded(widths, *arrays, dtype.type(slope))
+    return Padded(
+        widths, np.concatenate(weights), np.concatenate(transposed), np.concatenate(biases), dtype.type(slope)
+    )
 
 
 def _unpadded(network: Any, widths: Ints, weights: Floats, biases: Floats) -> Any:
