@@ -363,14 +363,14 @@ TABLES = {
         },
     )
     | rows(
-        f"{OURS}: the rates of what features and codes stand for, half floats, and when fields are written",
+        f"{OURS}: the rates of what features and codes stand for, half floats, and fields for files",
         rate__features=0.0025,
         rate__scale_codes=0.005,
         rate__rotation_codes=0.001,
         rate__feature_codes=0.0025,
         start_codes__rows_per_code=8,
         round_centres=[steps(29_001, 30_000)],
-        write_fields=[[30_000]],
+        write_fields=[steps(15_001, 30_000)],
     ),
     "pixel-order": GS_ACCEL | rows(f"{OURS}: exact by default", render__buffer_size=None),
     "polygons": GS_ACCEL,

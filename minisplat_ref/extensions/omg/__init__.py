@@ -21,8 +21,8 @@ to any Gaussians (:mod:`minisplat_ref.extensions.omg.file`).
     minisplat-ref study omg/distinctiveness room --out DIR
     minisplat-ref study omg/files room --out DIR
 
-The last event writes what networks and codes make into the six fields of 3DGS, so ``point_cloud.ply`` is one that every
-viewer draws, and every format can hold. ``docs/FAMILY.md`` has the measured figures.
+What networks and codes make is written into the six fields of 3DGS in every iteration, so ``point_cloud.ply`` is one
+that every viewer draws and every format can hold. ``docs/FAMILY.md`` has the measured figures.
 
 Where the paper says nothing, this is chosen here: the networks begin with the outputs that the Gaussians had; their
 learning rates; that their gradient does not reach the centres; the radius in which the scene is not contracted; and

@@ -162,7 +162,10 @@ def round_centres(state: TrainState, iteration: Iteration) -> None:
 
 
 def write_fields(state: TrainState, iteration: Iteration) -> None:
-    """Write into the fields of 3DGS what networks and codebooks make of features and codes, for files."""
+    """Write into the fields of 3DGS what networks and codebooks make of features and codes.
+
+    Nothing reads them during the training. But a file has these fields alone, and may be written after any iteration.
+    """
     decoded, _ = decode(state.model, networks_for(iteration.render_settings.backend))
     state.gaussians = contiguous(decoded)
 
@@ -185,7 +188,7 @@ OMG = MINI_SPLATTING._replace(
         *(ours for event in MINI_SPLATTING.events for ours in _with_ours(event)),
         At(CODES_FROM, _start_codes),
         During(round_centres, start=CODES_FROM),
-        At(30_000, write_fields),
+        During(write_fields, start=NETWORKS_FROM),
     ),
 )
 """The recipe ``omg``: Mini-Splatting whose last pruning also considers distinctiveness, with networks and codebooks."""
