@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.decoding import encode_places, gather, gather_vjp, run_networks
 from minisplat_ref.extensions.omg.method import fit_last_layer, round_centres, start_codes, start_networks, write_fields
 from minisplat_ref.extensions.omg.population import PLACE, OmgGaussians, place_of, with_features, without_features
@@ -22,9 +23,9 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import action_name, configure, scale_recipe, without
 from minisplat_ref.training.state import Iteration, apply_edit
-from minisplat_ref.types import Gaussians, Model, Scene, View
+from minisplat_ref.types import FILE_FRAME, Gaussians, Model, Scene, View
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT
+from tolerances import CLOSED_FORM, HALF_FLOAT, PARITY_FLOAT32_GRADIENT
 
 
 def row(*numbers):
@@ -244,6 +245,21 @@ def test_in_the_end_the_fields_are_what_is_drawn(scene):
     plain = Gaussians(*state.gaussians[:6])
     assert RenderSettings(scene.background).render(plain, view)[0].image.tobytes() == image.tobytes()
     assert settings.render(state.model, view)[0].image.tobytes() == image.tobytes()
+
+
+def test_a_file_keeps_each_row_together(scene):
+    """Of 120 Gaussians in Morton order, each has its own centre, codes and colour."""
+    state, iteration = state_and_iteration(scene)
+    state.gaussians.log_scales[:] = np.random.default_rng(0).normal(size=(120, 3))
+    start_networks(state, iteration)
+    start_codes(state, iteration, **LIMITS, rows_per_code=2)
+    write_fields(state, iteration)
+    back = trained_file.decode(trained_file.encode(state.model, FILE_FRAME), "a")
+    found, expected = np.lexsort(back.means.T), np.lexsort(state.gaussians.means.T)
+    assert (np.diff(expected) != 1).any()
+    for name in ("means", "log_scales", "sh_dc"):
+        a, b = getattr(back, name)[found], getattr(state.gaussians, name)[expected]
+        assert_allclose(a, b, atol=20 * HALF_FLOAT * np.abs(b).max(), err_msg=name)
 
 
 def test_without_its_events_it_trains_as_mini_splatting(scene):
