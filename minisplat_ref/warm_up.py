@@ -203,7 +203,8 @@ def _draw_extension(extension: Extension, dtype: Dtype) -> None:
     photograph = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     view = View("a", _camera(), photograph, None, point_ids=ids, view_id=0, time=0.5)
     scene = Scene("tiny", (view,), (), gaussians.means.astype(np.float64), gray, np.zeros(3), extent=1.0)
-    model = Model(representation.extend(gaussians, rng), representation.shared(scene, rng))
+    populate = extension.sample or representation.extend
+    model = Model(populate(gaussians, rng), representation.shared(scene, rng))
     renderer, own = representation.renderer, [term._replace(weight=1.0) for term in extension.losses]
     for terms in (GS.losses, (*GS.losses, *own)):
         request = Request(np.zeros(3, dtype), wants=frozenset[str]().union(*(term.wants for term in terms)))

@@ -67,6 +67,7 @@ def add_parser(commands: Commands) -> None:
     )
     others = parser.add_mutually_exclusive_group()
     others.add_argument("--stages", action="store_true", help="instead: the time of a training iteration by stages")
+    others.add_argument("--networks", action="store_true", help="instead: small networks, kernels beside NumPy")
     others.add_argument(
         "--extension", metavar="NAME", help="instead: an extension's renderer on both backends, beside 3DGS's"
     )
@@ -108,6 +109,8 @@ def publish(report: "Report", args: argparse.Namespace) -> int:
 def _measure(args: argparse.Namespace) -> "Report":
     if args.stages:
         return _profile(args)
+    if args.networks:
+        return _networks(args)
     if args.extension is not None:
         return _extension(args)
     return _benchmark(args)
@@ -148,6 +151,15 @@ def _extension(args: argparse.Namespace) -> "Report":
     cases = [case for workload in workloads for case in extension_cases(extension, workload, args.repeats, progress)]
     title = f"Renderer of {extension.name} beside that of 3DGS, each against its own float64 reference"
     return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
+
+
+def _networks(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.network_times import N_ROWS, network_cases
+    from minisplat_ref.jit.compile import n_threads
+    from minisplat_ref.oracle.cases import Report
+
+    title = f"Networks and encodings of {N_ROWS:,} rows, {n_threads()} threads: kernels beside NumPy"
+    return Report(title, tuple(network_cases(args.repeats)), {"rows": N_ROWS, "repeats": args.repeats})
 
 
 def _profile(args: argparse.Namespace) -> "Report":

@@ -87,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
         lines = [f"  {name}: {value}" for name, value in rows]
     size = f"{out.stat().st_size:,} bytes"
     print(f"{len(source.model.gaussians.means):,} Gaussians of {source.what} in {out}, {size}", *lines, sep="\n")
-    if source.model.shared:
-        names = ", ".join(source.model.shared)
+    own = source.owner.representation.rates.of if source.owner.saves_plain else {}  # its files need none of these
+    if names := ", ".join(name for name in source.model.shared if name not in own):
         print(f"minisplat-ref: a {out.suffix} does not hold {names}, which belong to no row", file=sys.stderr)
     return 0
 

@@ -42,6 +42,8 @@ class Extension(NamedTuple):
     """``load(path, type)`` of the population's type."""
     commands: tuple[ModuleType, ...] = ()
     """Modules with ``add_parser(commands)`` and ``run(args)``: ``minisplat-ref NAME COMMAND``."""
+    saves_plain: bool = False
+    """Whether ``save`` writes what 3DGS draws, and ``load`` reads the six fields: then its files have no label."""
     stages: Callable[..., Any] | None = None
     """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks, besides others."""
     sample: Callable[[Gaussians, np.random.Generator], Any] | None = None
@@ -56,7 +58,7 @@ class Extension(NamedTuple):
     def label(self) -> Label:
         """What its files say about how they are drawn: nothing where 3DGS draws them."""
         is_plain = (self.representation.population, self.representation.renderer) == (Gaussians, SPLATTING)
-        return NO_LABEL if is_plain else Label(self.name)
+        return NO_LABEL if is_plain or self.saves_plain else Label(self.name)
 
 
 CORE = Extension("core")

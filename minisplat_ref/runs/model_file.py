@@ -141,7 +141,7 @@ def read_population(path: Path, owner: Extension) -> Any:
     format_ = find_format(path)
     if format_ is None:
         return owner.load(path, owner.representation.population)
-    if owner.representation.population is not Gaussians:
+    if owner.representation.population is not Gaussians and not owner.saves_plain:
         fields = ", ".join(set(owner.representation.population._fields) - set(Gaussians._fields))
         raise InputError(f"{path}: {format_.suffix} does not hold {fields} of extension {owner.name}: give a PLY")
     return format_.decode(formats.read_content(path), path)

@@ -16,19 +16,21 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_format, find_recipe
 from minisplat_ref.extensions.omg import file as omg
-from minisplat_ref.extensions.omg import study
+from minisplat_ref.extensions.omg import study, trained_file
 from minisplat_ref.extensions.omg.appearance import features_of, fit_decoder
 from minisplat_ref.extensions.omg.method import prune_indistinct
+from minisplat_ref.extensions.omg.pack import read_training
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.omg.svq import fit_codes, quantise
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import indoor
+from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.schedule import action_name
+from minisplat_ref.training.schedule import action_name, firing_steps
 from minisplat_ref.training.state import Iteration
-from minisplat_ref.types import Gaussians
+from minisplat_ref.types import Frame, Gaussians
 from scenes import as_dtype, balls, make_camera
 from tolerances import CLOSED_FORM, HALF_FLOAT
 
@@ -47,6 +49,14 @@ def test_distinctiveness_by_hand(rng):
     for _ in range(5):
         rows = rng.permutation(6)
         assert_allclose(local_distinctiveness(means[rows], colors[rows]), expected[rows], atol=CLOSED_FORM)
+
+
+def test_neighbours_are_found_in_the_box_of_the_centres():
+    """In a box of 8 x 1, the upper half is behind the whole lower one; in a cube, x alone would decide."""
+    means = np.array([[0.0, 0, 0], [0.0, 1, 0], [2.0, 0, 0], [8.0, 1, 0]])
+    gray = np.array([0.0, 10.0, 1.0, 13.0])  # in the order of the box: 0, 1, 10, 13; of the cube: 0, 10, 1, 13
+    colors = np.repeat(gray[:, None], 3, axis=1)
+    assert_allclose(local_distinctiveness(means, colors), [2.0, 12.0, 10.0, 6.0], rtol=CLOSED_FORM)
 
 
 def test_distinctiveness_is_the_mean_of_the_channels():
@@ -118,14 +128,14 @@ def test_where_all_colours_are_alike_it_does_nothing(scene):
     assert "all colours are alike" in note and len(state.gaussians.means) == len(scene.points)
 
 
-def test_the_recipe_is_mini_splatting_but_for_its_last_pruning():
-    recipe = find_recipe("omg")
-    pairs = list(zip(recipe.events, MINI_SPLATTING.events, strict=True))
-    changed = [(ours, theirs) for ours, theirs in pairs if ours != theirs]
-    assert [(action_name(ours), action_name(theirs)) for ours, theirs in changed] == [
-        ("prune_indistinct", "prune_tail")
+def test_the_recipe_is_mini_splatting_but_for_its_last_pruning_and_what_comes_with_networks_and_codes():
+    names = [action_name(event) for event in find_recipe("omg").events]
+    theirs = [action_name(event) for event in MINI_SPLATTING.events]
+    own = {"start_networks", "start_codes", "round_centres", "write_fields"}
+    assert [name for name in names if name not in own] == [
+        "prune_indistinct" if name == "prune_tail" else name for name in theirs
     ]
-    assert changed[0][0].step == changed[0][1].step == 20_000
+    assert own < set(names) and firing_steps(find_recipe("omg"), prune_indistinct) == [20_000]
 
 
 # Codebooks
@@ -351,13 +361,86 @@ def test_train_convert_draw_and_measure(folders, tmp_path, capsys):
     assert "codes" in capsys.readouterr().out
 
 
+def test_pack_a_training(folders, tmp_path, capfd):
+    """The file of a run's codes and networks has what its PLY has, but for half floats; every command reads it."""
+    _, run = folders
+    out = tmp_path / "a.omg"
+    assert main(["omg", "pack", str(run / "checkpoint.npz"), "--out", str(out)]) == 0
+    n = len(load_ply(run / "point_cloud.ply").means)
+    assert f"{n} Gaussians in {out}, {out.stat().st_size:,} bytes" in capfd.readouterr().out
+    assert main(["convert", str(out), str(tmp_path / "a.ply")]) == 0
+    expected, found = (load_ply(ply) for ply in (run / "point_cloud.ply", tmp_path / "a.ply"))
+    for name in Gaussians._fields:
+        a, b = (getattr(g, name)[np.lexsort(g.means.T)] for g in (expected, found))
+        assert_allclose(b, a, atol=20 * HALF_FLOAT * max(1, np.abs(a).max()), err_msg=name)
+    assert np.abs(expected.sh_rest).max() > 1e-4  # networks have been trained
+    camera = ["--cameras", str(run / "cameras.json"), "--out", str(tmp_path / "views")]
+    assert main(["render", str(out), *camera]) == 0
+    assert main(["info", str(out)]) == 0
+    assert "weights as half floats" in capfd.readouterr().out
+    other, missing = tmp_path / "a.spz", tmp_path / "b.omg"
+    assert main(["omg", "pack", str(run), "--out", str(missing)]) == 2
+    assert "is a folder: give the checkpoint.npz in it" in capfd.readouterr().err
+    assert main(["omg", "pack", str(run / "checkpoint.npz"), "--out", str(other)]) == 2
+    assert "is not named .omg" in capfd.readouterr().err and not other.exists() and not missing.exists()
+
+
+def test_damaged_trained_files(folders, rng):
+    _, run = folders
+    content = trained_file.encode(*read_training(run / "checkpoint.npz"))
+    check_damage(omg.OMG_FILE, content, rng, 60)
+    check_headers(omg.OMG_FILE, content, rng, 100)
+    for lie in ({"n": -1}, {"unit": 0.0}, {"inverse_radius": 1e99}, {"codes": {}}, {"planes": {}}, {"center": [1, 2]}):
+        assert "does not describe Gaussians" in refusal(omg.OMG_FILE, with_header(content, **lie))
+    few = {"scale_codes": [0, 0, 0], "rotation_codes": [0, 0], "feature_codes": [0, 0, 0]}
+    assert "damaged" in refusal(omg.OMG_FILE, with_header(content, codes=few))
+
+
+def test_a_run_without_codes_is_not_packed(folders):
+    _, run = folders
+    model, frame = read_training(run / "checkpoint.npz")
+    g = model.gaussians
+    for columns in (g.codes[:, :0], g.codes[:, :5]):
+        with pytest.raises(InputError, match="no codes for its features"):
+            trained_file.encode(model._replace(gaussians=g._replace(codes=columns)), frame)
+
+
+def test_a_file_is_in_the_frame_of_the_scene(folders):
+    """A run in a frame that is moved and eight times as large has a file in that of the photographs."""
+    _, run = folders
+    model, frame = read_training(run / "checkpoint.npz")
+    plain = trained_file.decode(trained_file.encode(model, frame), "a")
+    moved = trained_file.decode(trained_file.encode(model, Frame((10.0, 20.0, -30.0), 8.0)), "a")
+    assert_allclose(moved.means, 8 * plain.means + [10, 20, -30], rtol=1e-6)
+    assert_allclose(moved.log_scales, plain.log_scales + np.log(8), rtol=1e-6)
+    assert_array_equal(moved.sh_dc, plain.sh_dc)
+
+
+def test_study_of_files(folders, tmp_path, capsys):
+    """Sizes and losses in the table are those of the files."""
+    nook, run = folders
+    checkpoint = run / "checkpoint.npz"
+    command = ["study", "omg/files", str(nook), "--checkpoints", str(checkpoint), "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    (record,) = json.loads((tmp_path / "out" / "result.json").read_text())["runs"]
+    rows = {row["file"]: row for row in record["rows"]}
+    assert rows["as trained"]["lost"] == 0 and {".spz 0", ".msz 0", ".omg 4", ".omg of the training"} < set(rows)
+    assert rows[".omg of the training"]["n_bytes"] == len(trained_file.encode(*read_training(checkpoint)))
+    assert rows[".omg 2"]["n_bytes"] == len(omg.encode(load_ply(run / "point_cloud.ply"), 2))
+    assert abs(rows[".msz 0"]["lost"]) < 1e-6 < abs(rows[".omg 4"]["lost"])
+    assert ".omg of the training" in capsys.readouterr().out
+
+
 def test_study(folders, tmp_path, capsys):
     nook, run = folders
-    command = ["study", "omg/distinctiveness", str(nook), "--fine-tune", "3", "--out", str(tmp_path / "out"), "--ply"]
-    assert main([*command, str(run / "point_cloud.ply")]) == 2  # of five Gaussians both choices keep the same
+    command = ["study", "omg/distinctiveness", str(nook), "--fine-tune", "3", "--seeds", "0", "--ply"]
+    save_ply(tmp_path / "two.ply", take(load_ply(run / "point_cloud.ply"), np.arange(2)))
+    few = [*command, str(tmp_path / "two.ply"), "--out", str(tmp_path / "few")]
+    assert main(few) == 2  # two Gaussians differ from each other alike: both choices keep the same
     assert "'with distinctiveness' measured exactly what 'importance' did" in capsys.readouterr().err
     save_ply(tmp_path / "more.ply", initial_state(load_scene(nook), get_recipe("3dgs"), seed=0).gaussians)
-    assert main([*command, str(tmp_path / "more.ply")]) == 0
+    more = [*command, str(tmp_path / "more.ply"), "--out", str(tmp_path / "out")]
+    assert main(more) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     rows = result["runs"][0]
     assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]
@@ -368,6 +451,8 @@ def test_study(folders, tmp_path, capsys):
     assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in images of 32 x 24
     assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
     assert "textured half" in capsys.readouterr().out
+    assert main(more) == 0  # continues: there is nothing left to measure
+    assert json.loads((tmp_path / "out" / "result.json").read_text()) == result
 
 
 def test_the_flatter_half_is_half():

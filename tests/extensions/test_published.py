@@ -388,6 +388,29 @@ TABLES = {
         prune_indistinct__metric="indoor",
         prune_indistinct__distinct_mass=0.99,
         prune_indistinct__distinct_power=2.0,
+        start_networks=[[15_000]],
+        start_codes=[[29_000]],
+        start_codes__scale_codes=64,
+        start_codes__rotation_codes=512,
+        start_codes__feature_codes=1024,
+        rate__codes=0.0,
+        rate__place=0.0,
+        **{
+            f"rate__{network}_{kind}_{k}": (1e-3, 1e-4, 30_000)
+            for network in ("space", "color", "opacity", "harmonics")
+            for kind in ("weights", "biases")
+            for k in (0, 1)
+        },
+    )
+    | rows(
+        f"{OURS}: the rates of what features and codes stand for, half floats, and fields for files",
+        rate__features=0.0025,
+        rate__scale_codes=0.005,
+        rate__rotation_codes=0.001,
+        rate__feature_codes=0.0025,
+        start_codes__rows_per_code=8,
+        round_centres=[steps(29_001, 30_000)],
+        write_fields=[steps(15_001, 30_000)],
     ),
     "pixel-order": GS_ACCEL | rows(f"{OURS}: exact by default", render__buffer_size=None),
     "polygons": GS_ACCEL,
@@ -452,6 +475,11 @@ CONSTANTS = [
     ("gaustudio.densities", "THRESHOLD", 2e-4, "3DGS, section 5.2"),
     ("gaustudio.densities", "SIZE_FRACTION", 0.01, "3DGS, released code of 2023"),
     ("gaustudio.losses", "DSSIM_WEIGHT", 0.2, "3DGS, section 5.1"),
+    ("omg.population", "N_STATIC", 3, "OMG, static features"),
+    ("omg.population", "N_VIEW", 3, "OMG, view-dependent features"),
+    ("omg.population", "N_SPACE", 13, "OMG, features of the place"),
+    ("omg.population", "N_OCTAVES", 16, "OMG, encoding of the place"),
+    ("omg.population", "HIDDEN", 64, "OMG, hidden layers"),
     ("polygons.method", "LOG_THICKNESS", np.log(1e-5), "REdiSplats, released code"),
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),

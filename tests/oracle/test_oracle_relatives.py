@@ -206,7 +206,7 @@ def test_calibrations_of_a_recipe_are_checked(small_proof, monkeypatch):
 # --- nothing ---
 
 
-@pytest.mark.parametrize("name", ["omg", "compression", "proxies"])
+@pytest.mark.parametrize("name", ["compression", "proxies"])
 def test_what_has_nothing_of_its_own_fails(name, capsys):
     code, output = proof(capsys, name)
     assert code == 1 and "1 of 1 cases failed" in output

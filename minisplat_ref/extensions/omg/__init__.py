@@ -1,4 +1,4 @@
-"""OMG: few Gaussians, chosen by how they differ from their neighbours, in sub-vector codebooks.
+"""OMG: few Gaussians, chosen by how they differ from their neighbours, with networks and sub-vector codebooks.
 
 This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps what is important to
 the photographs, but of two important Gaussians side by side that look alike, one would do. So the pruning score is
@@ -7,37 +7,87 @@ multiplied by the difference of a Gaussian's colour from its neighbours' in Mort
 
     S_i = I_i LD_i^lambda,   LD_i = mean_channels |c_i - c_prev| + |c_i - c_next|,   lambda = 2
 
-and the Gaussians of the largest scores that together carry 99 % of the sum stay
-(:mod:`minisplat_ref.extensions.omg.method`). They are stored with few attributes. The appearance has three parameters
-of colour and a few features, from which a shared decoder computes the spherical harmonics
-(:mod:`minisplat_ref.extensions.omg.appearance`). Each vector is split into parts, with a codebook for each part
-(:mod:`minisplat_ref.extensions.omg.svq`). ``.omg`` is the file (:mod:`minisplat_ref.extensions.omg.file`).
+and the Gaussians of the largest scores that together carry tau = 99 % of the sum stay
+(:mod:`minisplat_ref.extensions.omg.method`). From iteration 15,000 on a Gaussian has six features instead of opacity
+and 48 coefficients of colour; small networks compute these from the features and from the place
+(:mod:`minisplat_ref.extensions.omg.decoding`). From 29,000 on scales, rotations and features are split into parts of
+one or two numbers, each part is an index into a codebook of its own (:mod:`minisplat_ref.extensions.omg.svq`), and the
+codebooks are trained. ``.omg`` is the file: of a training (:mod:`minisplat_ref.extensions.omg.trained_file`), or fitted
+to any Gaussians (:mod:`minisplat_ref.extensions.omg.file`).
 
     minisplat-ref train SCENE --recipe omg --out runs/small
-    minisplat-ref convert runs/small small.omg
+    minisplat-ref omg pack runs/small/checkpoint.npz --out small.omg
+    minisplat-ref convert runs/other fitted.omg
     minisplat-ref study omg/distinctiveness room --out DIR
+    minisplat-ref study omg/files room --out DIR
 
-``docs/FAMILY.md`` has the measured figures.
+What networks and codes make is written into the six fields of 3DGS in every iteration, so ``point_cloud.ply`` is one
+that every viewer draws and every format can hold. ``docs/FAMILY.md`` has the measured figures.
 
-This deviates from the paper in four ways. The paper's networks, trained from iteration 15,000 on, are replaced by a
-linear decoder that is fitted when the file is written; opacity, which a network computes there, has a codebook. The
-paper trains for 1,000 more iterations with the codes; here they are fitted after the training. Centres are packed as
-differences in Morton order instead of by a point-cloud coder, and indices by zstandard instead of Huffman coding and
-xz. The released code seems to use the sorting permutation where its inverse is meant, which is the same only if the
-rows are sorted already; here it is the inverse.
+Where the paper says nothing, this is chosen here: the networks begin with the outputs that the Gaussians had; their
+learning rates; that their gradient does not reach the centres; the radius in which the scene is not contracted; and
+codebooks of few Gaussians, which are smaller (at most one code for eight). It deviates from the paper in the file:
+centres are packed as differences in Morton order instead of by a point-cloud coder, and indices by zstandard instead of
+Huffman coding and xz. The released code seems to use the sorting permutation where its inverse is meant, which is the
+same only if the rows are sorted already; here it is the inverse.
 """
 
+from pathlib import Path
+
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.omg import pack
 from minisplat_ref.extensions.omg.file import OMG_FILE
 from minisplat_ref.extensions.omg.method import OMG
-from minisplat_ref.studies.study import declare, fine_tune, trainings
+from minisplat_ref.extensions.omg.population import load_plain, save_plain, with_features
+from minisplat_ref.extensions.omg.renderer import COMPACT
+from minisplat_ref.extensions.omg.stages import stages
+from minisplat_ref.studies.study import (
+    CONTINUES,
+    OUT,
+    PLY,
+    RESUMED_OUT,
+    SEEDS,
+    argument,
+    declare,
+    downscale,
+    fine_tune,
+    iterations,
+    recipe,
+    scene,
+    seeds,
+)
 
 DISTINCTIVENESS = declare(
     "distinctiveness",
     "which 50, 25 and 12.5 % of the Gaussians to keep",
     f"{__name__}.study.run",
-    *trainings(1000, "mini-splatting2"),
-    fine_tune(200),
+    *(scene(), RESUMED_OUT, downscale(), recipe("mini-splatting2"), iterations(1000), PLY, SEEDS, fine_tune(200)),
+    description=f"Which 50, 25 and 12.5 % of the Gaussians to keep. {CONTINUES}",
 )
-EXTENSION = Extension("omg", recipes=(OMG,), formats=(OMG_FILE,), studies=(DISTINCTIVENESS,))
-"""The recipe ``omg``, the format ``.omg`` and a study."""
+FILES = declare(
+    "files",
+    "bytes and quality of the codes and networks, beside other files",
+    f"{__name__}.file_study.run",
+    *(scene(), OUT, downscale(), iterations(2000), seeds(3)),
+    argument(
+        "--checkpoints",
+        type=lambda text: [Path(part) for part in text.split(",")],
+        default=(),
+        metavar="A,B",
+        help="take these trainings of the recipe omg instead of training",
+    ),
+)
+EXTENSION = Extension(
+    "omg",
+    recipes=(OMG,),
+    representation=COMPACT,
+    save=save_plain,
+    load=load_plain,
+    saves_plain=True,
+    stages=stages,
+    sample=with_features,
+    commands=(pack,),
+    formats=(OMG_FILE,),
+    studies=(DISTINCTIVENESS, FILES),
+)
+"""The recipe ``omg`` with its renderer, the format ``.omg``, a command and studies."""

@@ -16,7 +16,6 @@ harmonics, which are a matrix product.
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +23,12 @@ import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
-from minisplat_ref.extensions.omg.svq import Quantised, quantise
+from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_differences, to_halves
+from minisplat_ref.extensions.omg.svq import QUAT_MIN, Quantised, quantise, unit_quats
 from minisplat_ref.io.formats import Format
+from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms.packing.container import (
     WAY_OUT,
     Container,
@@ -39,16 +41,13 @@ from minisplat_ref.mechanisms.packing.container import (
     write_label,
 )
 from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"OMG\n", version=1)
 GAUSSIANS_MAX = 2**31 - 1
 CODES_MAX = 2**16
-LARGEST_HALF = 65504.0
-FARTHEST = 1e30  # distance of a scene's median from the origin along an axis
-QUAT_MIN = 2.0**-10  # replaces w in a code (w, x) of zero, since (y, z) may be zero, too
 
 
 class Sizes(NamedTuple):
@@ -96,22 +95,21 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         raise InputError(
             f"means are {np.abs(center).max():.3g} from the origin: move the scene, or choose another format"
         )
-    offsets = _halves(gaussians.means - center, "means")
+    offsets = to_halves(gaussians.means - center, "means")
     order = morton_order(offsets)
     rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
     harmonics = rows.sh_rest.reshape(n, 3 * n_rest)
-    _halves(harmonics, "sh_rest")
+    to_halves(harmonics, "sh_rest")
     decoder = fit_decoder(harmonics, sizes.n_features)
     features = features_of(harmonics, decoder)
-    quats = rows.quats / np.linalg.norm(rows.quats, axis=1, keepdims=True)
     vectors = {
         "scales": rows.log_scales,
-        "rotations": quats * np.where(quats[:, :1] < 0, -1.0, 1.0),
+        "rotations": unit_quats(rows.quats),
         "opacities": rows.opacity_logits[:, None],
         "appearance": np.concatenate([rows.sh_dc, features, np.zeros((n, (3 + features.shape[1]) % 2))], axis=1),
     }
     quantised = {
-        name: quantise(_halves(values, name).astype(np.float64), WIDTHS[name], getattr(sizes, name))
+        name: quantise(to_halves(values, name).astype(np.float64), WIDTHS[name], getattr(sizes, name))
         for name, values in vectors.items()
     }
     is_zero = (quantised["rotations"].codes[0] == 0).all(axis=1)
@@ -142,25 +140,13 @@ def _center(gaussians: Gaussians) -> Floats:
 
 def order_of(gaussians: Gaussians) -> Ints:
     """Return the rows [N] of the Gaussians in the order of a file."""
-    return morton_order(_halves(gaussians.means - _center(gaussians), "means"))
-
-
-def _halves(values: Floats, name: str) -> Floats:
-    if not np.abs(values).max(initial=0.0) <= LARGEST_HALF:
-        raise InputError(
-            f"{name} reach {np.abs(values).max():.3g}, but half floats {LARGEST_HALF:g}: choose another format"
-        )
-    return values.astype(np.float16)
+    return morton_order(to_halves(gaussians.means - _center(gaussians), "means"))
 
 
 def _integers(offsets: Floats, quantised: Mapping[str, Quantised]) -> dict[str, Any]:
-    """Return the integers that are packed as planes: differences of the centres' ordered bit patterns, and indices."""
-    bits = offsets.view(np.int16).astype(np.int64)
-    ordered = np.where(bits < 0, -(bits & 0x7FFF), bits)  # ascending as the halves are; both zeros are 0
-    return {
-        "means": zigzag(np.diff(ordered, axis=0, prepend=0)),
-        **{name: of_parts.indices.astype(np.uint64) for name, of_parts in quantised.items()},
-    }
+    """Return the integers that are packed as planes of bytes: differences of the centres, and indices."""
+    indices = {name: of_parts.indices.astype(np.uint64) for name, of_parts in quantised.items()}
+    return {"means": to_differences(offsets), **indices}
 
 
 def decode(content: bytes, source: str | Path) -> Gaussians:
@@ -181,16 +167,14 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     packed = parse(CONTAINER, content, source)
     header = _check_header(packed)
     n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
-    differences = unzigzag(_planes(packed, header, "means", 3))
-    ordered = np.cumsum(differences, axis=0)
-    bits = np.where(ordered < 0, -ordered | 0x8000, ordered).astype(np.uint16)
+    offsets = from_differences(_planes(packed, header, "means", 3))
     vectors = {name: _vectors(packed, header, name) for name in WIDTHS}
     raw = unpack(packed, "decoder", 2 * (1 + header.n_features) * 3 * n_rest)
     table = np.frombuffer(raw, "<f2").reshape(1 + header.n_features, 3 * n_rest)
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files; what is not finite is refused
         harmonics = Decoder(table[0], table[1:]).harmonics(features)
-        means = np.asarray(header.center, np.float32) + bits.view(np.float16).astype(np.float32)
+        means = np.asarray(header.center, np.float32) + offsets.astype(np.float32)
     gaussians = Gaussians(
         means=means,
         quats=vectors["rotations"],
@@ -276,15 +260,37 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
     return [*rows, ("features", f"{header.n_features} for the higher harmonics")]
 
 
+def _of_training(content: bytes) -> bool:
+    """Return whether a file holds codes and networks as they were trained."""
+    return content[:4] == trained_file.CONTAINER.magic
+
+
+def _decode(content: bytes, source: str | Path) -> Gaussians:
+    """Read either kind of file."""
+    return trained_file.decode(content, source) if _of_training(content) else decode(content, source)
+
+
+def _describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
+    return trained_file.describe(content, source) if _of_training(content) else describe(content, source)
+
+
+def _write_label(content: bytes, label: Label) -> bytes:
+    return write_label(trained_file.CONTAINER if _of_training(content) else CONTAINER, content, label)
+
+
+def _read_label(content: bytes, source: str | Path) -> Label:
+    return read_label(trained_file.CONTAINER if _of_training(content) else CONTAINER, content, source)
+
+
 OMG_FILE = Format(
     suffix=".omg",
     summary="codebooks of sub-vectors, zstandard",
     levels=tuple(f"{sizes.appearance} codes of appearance" for sizes in LEVELS),
     default_level=2,
     encode=encode,
-    decode=decode,
-    describe=describe,
-    write_label=partial(write_label, CONTAINER),
-    read_label=partial(read_label, CONTAINER),
+    decode=_decode,
+    describe=_describe,
+    write_label=_write_label,
+    read_label=_read_label,
 )
-"""The format ``.omg``."""
+"""The format ``.omg``: fitted to any Gaussians, or of a training (:mod:`.trained_file`)."""

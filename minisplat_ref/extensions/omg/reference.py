@@ -6,6 +6,7 @@ With the colours c_i of degree 0, in Morton order of the centres::
     S_i  = I_i LD_i^lambda
 
 Morton order replaces a neighbour search and costs only a sort. It misses neighbours across the faces of large cells.
+Its cells have the proportions of the box that the centres fill, as in the released code.
 """
 
 import numpy as np
@@ -32,7 +33,7 @@ def local_distinctiveness(means: Floats, colors: Floats) -> Floats:
     n = len(means)
     if n < 2:
         return np.zeros(n)
-    order = morton_order(means)
+    order = morton_order(means, is_cubic=False)
     ordered = colors[order].astype(np.float64)  # [N, C]
     steps = np.abs(np.diff(ordered, axis=0)).mean(axis=1)  # [N - 1]
     around = np.concatenate([steps[:1], steps, steps[-1:]])  # [N + 1] before and after each

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
+from minisplat_ref.io.ply import load_ply
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import ViewMetrics, evaluate, psnr
 from minisplat_ref.rendering import RenderSettings
@@ -49,15 +50,23 @@ class Quality(NamedTuple):
 
 
 def run(args: argparse.Namespace) -> kit.Report:
-    """Train, prune, fine-tune and measure."""
+    """Train, prune, fine-tune and measure; each seed is a record, and a study that was interrupted continues."""
     scene = kit.read_scene(args.scene, args.downscale)
-    wholes = kit.populations(args, scene)
-    runs = [measure(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
-    by_seed = [losses_of_fields(whole, scene) for whole in wholes]
-    losses = {field: [of_seed[field] for of_seed in by_seed] for field in by_seed[0]}
-    result = {**kit.describe_trainings(args, scene), "fine_tune": args.fine_tune, "power": POWER}
-    result |= {"runs": runs, "losses": losses}
-    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations\n\n"
+    settings = {**kit.describe_scene(scene), **kit.settings_of(args, "recipe", "iterations", "fine_tune")}
+    settings |= {"power": POWER} | ({} if args.ply is None else {"ply": str(args.ply)})
+
+    def measure_seed(seed: int) -> list[dict[str, Any]]:
+        recipe = get_recipe(args.recipe, args.iterations)
+        whole = load_ply(args.ply) if args.ply else kit.train_with_progress(scene, recipe, seed).gaussians
+        return [{"rows": measure(whole, scene, args.fine_tune, seed), "losses": losses_of_fields(whole, scene)}]
+
+    jobs = [{"seed": seed} for seed in args.seeds]
+    records = [record for record in kit.resume(args.out, settings, jobs, measure_seed) if record["seed"] in args.seeds]
+    records.sort(key=lambda record: record["seed"])
+    runs = [record["rows"] for record in records]
+    losses = {field: [record["losses"][field] for record in records] for field in records[0]["losses"]}
+    result = {**settings, "seeds": list(args.seeds), "runs": runs, "losses": losses}
+    text = f"{kit.title(settings)}; {kit.seeds_of(args)}; fine-tuned {args.fine_tune} iterations\n\n"
     text += markdown_table(["kept", "by", "Gaussians", *COLUMNS], to_rows(runs))
     text += "\n\ndB lost by one field from the file, at each level\n\n"
     rows = [

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from minisplat_ref.types import Floats, Ints
 
 ITERATIONS = 12
+QUAT_MIN = 2.0**-10  # replaces w in a code (w, x) of zero, since (y, z) may be zero, too
 BITS_MAX = 50  # log2 of the cells per side
 SAMPLES_MAX = 1 << 17  # vectors to which codes are fitted, evenly spaced among all
 
@@ -55,7 +56,7 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
         part = vectors[:, begin : begin + width].astype(np.float64)
         book = np.unique(fit_codes(part, n_codes).astype(np.float16), axis=0)
         codes.append(book)
-        indices.append(_nearest(book.astype(np.float64), part))
+        indices.append(nearest(book.astype(np.float64), part))
     return Quantised(tuple(codes), np.stack(indices, axis=1))
 
 
@@ -66,11 +67,17 @@ def fit_codes(vectors: Floats, n_codes: int) -> Floats:
         return different
     codes = _initial_codes(different, n_codes)
     for _ in range(ITERATIONS):
-        rows = _nearest(codes, different)
+        rows = nearest(codes, different)
         counts = np.bincount(rows, minlength=n_codes)
         sums = np.stack([np.bincount(rows, weights=axis, minlength=n_codes) for axis in different.T], axis=1)
         codes = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], codes)
     return codes
+
+
+def unit_quats(quats: Floats) -> Floats:
+    """Return quaternions [N, 4] of length 1 with w >= 0, one of the two that stand for each rotation."""
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return unit * np.where(unit[:, :1] < 0, unit.dtype.type(-1), unit.dtype.type(1))
 
 
 def _initial_codes(vectors: Floats, n_codes: int) -> Floats:
@@ -85,7 +92,8 @@ def _initial_codes(vectors: Floats, n_codes: int) -> Floats:
     return vectors[rows[np.linspace(0, len(rows) - 1, n_codes).round().astype(int)]]
 
 
-def _nearest(codes: Floats, vectors: Floats) -> Ints:
+def nearest(codes: Floats, vectors: Floats) -> Ints:
+    """Return the row [N] of the code [K, w] nearest to each vector [N, w]."""
     if len(vectors) == 0:
         return np.zeros(0, np.int64)
     return cKDTree(codes).query(vectors)[1].astype(np.int64)

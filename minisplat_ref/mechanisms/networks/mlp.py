@@ -1,14 +1,17 @@
 """A multilayer perceptron in NumPy: forward, its gradient, and training on pairs by Adam.
 
-With the layers' weights W_l and biases b_l and the ReLU ``r(x) = max(x, 0)``::
+With the layers' weights W_l and biases b_l and the leaky ReLU ``r(x) = max(x, s x)`` of slope ``0 <= s < 1``, which at
+0 is the ReLU::
 
     h_0 = x,   h_{l+1} = r(h_l W_l + b_l),   y = h_{L-1} W_{L-1} + b_{L-1}
 
-Left out: encodings of the input, other activations, and a compiled twin; matrix products are BLAS's as it is.
+:mod:`.mlp_kernels` is the compiled twin. Here matrix products are BLAS's, so the last digits may depend on how many
+threads it takes; there they do not.
 """
 
+from collections.abc import Mapping
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,22 +45,26 @@ def make_network(sizes: tuple[int, ...], rng: np.random.Generator) -> Network:
     return tuple(Layer(rng.normal(size=(n, m)) * np.sqrt(2 / n), np.zeros(m)) for n, m in pairwise(sizes))
 
 
-def forward(network: Network, x: Floats) -> tuple[Floats, list[Floats]]:
-    """Return y [B, outputs] for x [B, inputs], and the inputs h_l of all layers for :func:`forward_vjp`."""
+def forward(network: Network, x: Floats, slope: float = 0.0) -> tuple[Floats, list[Floats]]:
+    """Return y [B, outputs] for x [B, inputs], and the inputs h_l of all layers for :func:`forward_vjp`.
+
+    ``slope`` is that of the leaky ReLU; 0 for the ReLU.
+    """
     inputs = []
     for layer in network[:-1]:
         inputs.append(x)
-        x = np.maximum(x @ layer.weights + layer.biases, 0)
+        x = x @ layer.weights + layer.biases
+        x = np.maximum(x, x.dtype.type(slope) * x)
     return x @ network[-1].weights + network[-1].biases, [*inputs, x]
 
 
-def forward_vjp(network: Network, inputs: list[Floats], v_y: Floats) -> tuple[Network, Floats]:
+def forward_vjp(network: Network, inputs: list[Floats], v_y: Floats, slope: float = 0.0) -> tuple[Network, Floats]:
     """Gradient of :func:`forward` with respect to the network and to x.
 
     ::
 
         v_W_l = h_l^T v,   v_b_l = sum over rows of v,   v_h_l = v W_l^T
-        v     = v_y in the last layer, v_h_{l+1} where h_{l+1} > 0 below
+        v     = v_y in the last layer; below, v_h_{l+1} where h_{l+1} > 0, and s v_h_{l+1} elsewhere
 
     Parameters
     ----------
@@ -66,14 +73,39 @@ def forward_vjp(network: Network, inputs: list[Floats], v_y: Floats) -> tuple[Ne
         From :func:`forward`.
     v_y : ndarray of shape (B, outputs)
         Derivative with respect to y.
+    slope : float
+        s, as in :func:`forward`.
     """
     v, gradients = v_y, []
     for k in range(len(network) - 1, -1, -1):
         gradients.append(Layer(inputs[k].T @ v, v.sum(axis=0)))
         v = v @ network[k].weights.T
         if k > 0:
-            v = np.where(inputs[k] > 0, v, 0)
+            v = np.where(inputs[k] > 0, v, v.dtype.type(slope) * v)
     return tuple(reversed(gradients)), v
+
+
+def to_shared(name: str, network: Network) -> dict[str, Floats]:
+    """Return the arrays of a network as shared parameters: ``NAME_weights_0``, ``NAME_biases_0``, and so on."""
+    return {
+        f"{name}_{kind}_{k}": array
+        for k, layer in enumerate(network)
+        for kind, array in zip(Layer._fields, layer, strict=True)
+    }
+
+
+def from_shared(name: str, shared: Mapping[str, Floats]) -> Network:
+    """Return the network of that name from shared parameters; one without layers if there is none."""
+    layers: list[Layer] = []
+    while f"{name}_weights_{len(layers)}" in shared:
+        k = len(layers)
+        layers.append(Layer(shared[f"{name}_weights_{k}"], shared[f"{name}_biases_{k}"]))
+    return tuple(layers)
+
+
+def network_rates(name: str, n_layers: int, rate: Any) -> dict[str, Any]:
+    """Return one learning rate, a number or a schedule, for all arrays of a network, by their shared names."""
+    return {f"{name}_{kind}_{k}": rate for k in range(n_layers) for kind in Layer._fields}
 
 
 def train_step(network: Network, x: Floats, y: Floats, rate: float, moments: list[Floats], step: int) -> float:

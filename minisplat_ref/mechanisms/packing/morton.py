@@ -20,13 +20,15 @@ _SPREAD = (
 )
 
 
-def cells_of(points: Floats | Ints) -> NDArray[np.uint64]:
-    """Return the cell of each point in the smallest cube that holds them all, with 2^21 cells per side.
+def cells_of(points: Floats | Ints, *, is_cubic: bool = True) -> NDArray[np.uint64]:
+    """Return the cell of each point in the smallest cube, or box, that holds them all, with 2^21 cells per side.
 
     Parameters
     ----------
     points : ndarray of shape (N, 3)
         Finite coordinates in any frame.
+    is_cubic : bool
+        Whether cells are cubes. In a box, they have its proportions: of a flat scene, all bits of all axes count.
 
     Returns
     -------
@@ -37,10 +39,11 @@ def cells_of(points: Floats | Ints) -> NDArray[np.uint64]:
         return np.zeros((0, 3), np.uint64)
     points = points.astype(np.float64)
     low = points.min(axis=0)  # [3]
-    side = float((points.max(axis=0) - low).max())
-    if side == 0.0:
-        return np.zeros(points.shape, np.uint64)
-    return np.minimum((points - low) / side * 2.0**BITS, 2.0**BITS - 1).astype(np.uint64)
+    sides = points.max(axis=0) - low  # [3]
+    if is_cubic:
+        sides[:] = sides.max()
+    parts = np.divide(points - low, sides, out=np.zeros(points.shape), where=sides > 0)  # [N, 3] of the side
+    return np.minimum(parts * 2.0**BITS, 2.0**BITS - 1).astype(np.uint64)
 
 
 def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -51,6 +54,6 @@ def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return spread[:, 0] | (spread[:, 1] << np.uint64(1)) | (spread[:, 2] << np.uint64(2))
 
 
-def morton_order(points: Floats | Ints) -> Ints:
+def morton_order(points: Floats | Ints, *, is_cubic: bool = True) -> Ints:
     """Return the rows [N] of points [N, 3] in Morton order; points of one cell keep their order."""
-    return np.argsort(morton_codes(cells_of(points)), kind="stable")
+    return np.argsort(morton_codes(cells_of(points, is_cubic=is_cubic)), kind="stable")
