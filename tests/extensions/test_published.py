@@ -395,15 +395,15 @@ TABLES = {
         start_codes__feature_codes=1024,
         rate__codes=0.0,
         rate__place=0.0,
+    )
+    | rows(
+        f"{OURS}: rates of networks, features and codes, half floats, and fields for files",
         **{
             f"rate__{network}_{kind}_{k}": (1e-3, 1e-4, 30_000)
             for network in ("space", "color", "opacity", "harmonics")
             for kind in ("weights", "biases")
             for k in (0, 1)
         },
-    )
-    | rows(
-        f"{OURS}: the rates of what features and codes stand for, half floats, and fields for files",
         rate__features=0.0025,
         rate__scale_codes=0.005,
         rate__rotation_codes=0.001,

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.mechanisms.surfels.discs import as_surfels
+from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.training.representation import as_it_is
 from minisplat_ref.types import Gaussians
