@@ -234,3 +234,19 @@ def test_the_study_measures_what_it_says(monkeypatch):
     assert records[1]["hidden_psnr"] > records[0]["hidden_psnr"] + 3
     recovered = study.recover(truths, rng)
     assert recovered["error_after"] < recovered["error_before"]
+
+
+def test_blending_by_centres_makes_normals_lean_towards_the_camera():
+    """As docs/FAMILY.md says: on a sphere, the blended normal is nearer to the view than the true one."""
+    [camera, *_] = study._cameras(np.random.default_rng(0))
+    truth = study.trace(camera, prefilter(study.environment()))
+    metal = study.metal_of(study.sphere_of(500, 0.0, np.random.default_rng(0)))
+    request = Request(wants=frozenset({"normal"}))
+    output, _ = REFLECTIVE.render(study.model_of(metal, PER_PIXEL), view_from(camera), request)
+    found = (
+        output.image[truth.is_sphere][:, 3:6] / np.linalg.norm(output.image[truth.is_sphere][:, 3:6], axis=1)[:, None]
+    )
+    rays = pinhole_rays(np.arange(96) + 0.5, np.arange(72)[:, None] + 0.5, camera)[truth.is_sphere]
+    to_camera = -rays / np.linalg.norm(rays, axis=1)[:, None]
+    expected = truth.normals @ camera.cam_from_world_R.T
+    assert (np.sum(found * to_camera, axis=1) > np.sum(expected * to_camera, axis=1)).mean() > 0.95
