@@ -1,4 +1,4 @@
-"""OMG: few Gaussians that differ from their neighbours, decoded by networks and stored by codebooks.
+"""OMG: few Gaussians that differ from their neighbours, with networks and codebooks.
 
 This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps what is important to
 the photographs, but of two important Gaussians side by side that look alike, one would do. So the pruning score is

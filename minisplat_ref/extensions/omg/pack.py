@@ -15,8 +15,9 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "pack",
         help="write the codes and networks of a run as .omg",
-        description="Write the codes and networks of a run of the recipe omg, as they were trained, into one file,\n"
-        "which every command reads that reads a PLY. (convert fits codes to the Gaussians of any run.)",
+        description="Write the codes and networks of a run of the recipe omg, as they were trained,\n"
+        "into one file, which every command reads that reads a PLY. (convert fits codes\n"
+        "to the Gaussians of any run.)",
         epilog="example: minisplat-ref omg pack runs/small/checkpoint.npz --out small.omg",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,4 +1,4 @@
-"""Surfels with a material that are shaded after they are blended: mirrors and gloss in a learned environment.
+"""Surfels with a material, shaded after they are blended: mirrors and gloss.
 
 This follows Reflective Gaussian Splatting (Ref-Gaussian), Yao et al. 2024, arXiv 2412.19282. Each surfel of 2D
 Gaussian Splatting has an albedo a, a metallic share m and a roughness. Blended per pixel, with the normal n, they are
