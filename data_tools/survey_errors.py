@@ -52,7 +52,9 @@ _CALL = (
     PlantedLine(
         "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"
     ),
-    PlantedLine("1 - opacity rounded", "rendering:render_vjp", "1 / (1 + np.exp(g.opacity_logits))", "1 - opacities"),
+    PlantedLine(
+        "1 - opacity rounded", "rendering:activate_vjp", "1 / (1 + np.exp(opacity_logits))", "1 - primitives.opacities"
+    ),
 )
 _EQUALITY = (
     PlantedLine(

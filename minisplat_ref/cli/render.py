@@ -38,7 +38,6 @@ Cameras, by --cameras:
 """
 EPILOG = """\
 examples:
-  minisplat-ref render runs/fox
   minisplat-ref render runs/fox --cameras orbit --film fox.gif
   minisplat-ref render runs/fox --cameras orbit --arc 360 --frames 120 --depth
   minisplat-ref render point_cloud.ply --size 640x360 --profile INRIA
@@ -64,25 +63,18 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
     parser.add_argument(
-        "--map", choices=MAPS, help="also NAME_MAP.png of what has a material, or normals (camera frame, (n + 1) / 2)"
+        "--map", choices=MAPS, metavar="MAP", help="also NAME_MAP.png: albedo, metallic, roughness, normal"
     )
     parser.add_argument(
-        "--environment",
-        type=Path,
-        metavar="FILE",
-        help="other light: an image or .npy in latitude and longitude",
+        "--environment", type=Path, metavar="FILE", help="other light: an image by latitude and longitude"
     )
-    parser.add_argument(
-        "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
-    )
+    parser.add_argument("--extension", metavar="E", help="draws a file; core is 3DGS (default: what it names)")
     parser.add_argument(
         "--frames", type=integer(1), default=60, metavar="N", help="number of images of an orbit (default 60)"
     )
+    parser.add_argument("--arc", type=_arc, metavar="A", help="degrees of an orbit (default: what was photographed)")
     parser.add_argument(
-        "--arc", type=_arc, metavar="A", help="degrees that an orbit covers (default: what was photographed)"
-    )
-    parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="pixels of an orbit's images (default: the run's, or 640x480)"
+        "--size", type=_size, metavar="WxH", help="of an orbit's images (default: the run's, or 640x480)"
     )
     parser.add_argument(
         "--film", type=Path, metavar="FILE", help="also make a film: .gif, or .mp4 with imageio[ffmpeg]"
@@ -121,8 +113,8 @@ def run(args: argparse.Namespace) -> int:
     if args.film is not None:
         check_film(args.film, [(view.camera.width, view.camera.height) for view in views])
     names = file_names([view.name for view in views])
-    channels = _channels(args, source)
-    wants = frozenset(channels) - {"rgb"}
+    wants = frozenset({"depth"} if args.depth else ()) | frozenset({args.map} if args.map else ())
+    channels = _channels(args, source, wants)
     outputs = (source.trained.render(view_from(view.camera, time=view.time), wants) for view in views)
     first = next(outputs)  # what cannot be drawn is refused before the folder is touched
     _make_room(out, names)
@@ -130,15 +122,13 @@ def run(args: argparse.Namespace) -> int:
     for name, output in zip(names, drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
-            depth = source.frame.unit * expected_depth(
-                output.image[..., channels["depth"]][..., 0], output.alpha
-            )  # [H, W] as in the files
+            sums = output.image[..., channels["depth"].start]
+            depth = source.frame.unit * expected_depth(sums, output.alpha)  # [H, W] as in the files
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_image(depth, *depth_range(depth)))
         if args.map:
-            write_image(
-                out / f"{name}_{args.map}.png", map_image(args.map, output.image[..., channels[args.map]], output.alpha)
-            )
+            shown = map_image(args.map, output.image[..., channels[args.map]], output.alpha)
+            write_image(out / f"{name}_{args.map}.png", shown)
     print(f"{len(views)} images in {out}")
     if args.film is not None:
         write_film(args.film, [out / f"{name}.png" for name in names], args.fps)
@@ -146,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _channels(args: argparse.Namespace, source: "_Source") -> dict[str, slice]:
+def _channels(args: argparse.Namespace, source: "_Source", wants: frozenset[str]) -> dict[str, slice]:
     """Return the channels that are drawn, by name.
 
     Raises
@@ -154,10 +144,11 @@ def _channels(args: argparse.Namespace, source: "_Source") -> dict[str, slice]:
     InputError
         The renderer has no map of that name.
     """
-    renderer, wants = source.trained.renderer, {"depth"} if args.depth else set()
-    if args.map and args.map not in renderer.channels(frozenset({args.map})):
+    renderer = source.trained.renderer
+    channels = renderer.channels(wants)
+    if args.map and args.map not in channels:
         raise InputError(f"{args.input} has no map {args.map}: it is drawn as {renderer.name}; leave --map out")
-    return renderer.channels(frozenset(wants | {args.map} if args.map else wants))
+    return channels
 
 
 def _make_room(out: Path, names: Sequence[str]) -> None:
