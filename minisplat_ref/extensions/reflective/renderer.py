@@ -37,12 +37,14 @@ from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.projection import SurfelGradient, centers_moved, project_vjp
-from minisplat_ref.reference.pinhole import pinhole_rays, pose, with_principal_point
+from minisplat_ref.reference.pinhole import pose, with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, choose_degree, parameters_vjp
+from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
 
 MAPS = {"albedo": 3, "metallic": 1, "roughness": 1}
 """The material's channels, in the order in which surfels carry them."""
+RAY_START = 0.02  # of the pixel's depth: where a reflected ray begins, so that it misses its own surface
 GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
 
 
@@ -271,12 +273,7 @@ def _pixels(output: RenderOutput, slices: dict[str, slice], camera: Camera, requ
     rows = np.flatnonzero((alpha > request.conventions.alpha_min / 2) & (lengths[:, 0] > 0))
     first = max(part.stop for part in slices.values())
     blended = np.column_stack([flat[rows, :3], normals[rows], flat[rows, first:]])
-    return _Pixels(rows, alpha[rows], blended, lengths[rows], -_unit_rays(camera, rows, flat.dtype))
-
-
-def _unit_rays(camera: Camera, pixels: Ints, dtype: np.dtype) -> Floats:
-    rays = pinhole_rays(pixels % camera.width + 0.5, pixels // camera.width + 0.5, camera)
-    return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(dtype)
+    return _Pixels(rows, alpha[rows], blended, lengths[rows], -unit_rays(camera, rows, flat.dtype))
 
 
 def _visibility(surface: Surface, output: RenderOutput, pixels: _Pixels, seen: discs.Seen, request: Request) -> Floats:
@@ -284,16 +281,13 @@ def _visibility(surface: Surface, output: RenderOutput, pixels: _Pixels, seen: d
     depth = output.image.reshape(-1, output.image.shape[2])[pixels.rows, 3] / pixels.alpha
     camera = with_principal_point(seen.camera, request.conventions)
     R, t = pose(camera, np.dtype(np.float64))
-    ray = _unit_rays(camera, pixels.rows, np.dtype(np.float64))
+    ray = unit_rays(camera, pixels.rows, np.dtype(np.float64))
     points = (ray / ray[:, 2:] * depth[:, None] - t) @ R
     n, v = surface.normals.astype(np.float64), surface.to_camera.astype(np.float64)
     r = 2 * np.sum(n * v, axis=1, keepdims=True) * n - v
     near = RAY_START * depth
     rays = Rays(points, r, near, np.full_like(near, np.inf))
     return transmittances(seen.primitives, rays, request.conventions, request.backend).astype(output.image.dtype)
-
-
-RAY_START = 0.02  # of the pixel's depth: where a reflected ray begins, so that it misses its own surface
 
 
 def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
