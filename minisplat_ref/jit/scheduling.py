@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 
 from minisplat_ref.jit.compile import scalar
@@ -31,25 +30,25 @@ def make_shared_counter():
     return taken
 
 
-def fetch_and_increment(taken: Any) -> int:
-    """Increment the counter atomically and return its old value; no two threads get the same number."""
-    taken[0] += 1
-    return int(taken[0]) - 1
+def fetch_and_add(counter: Any, n: int) -> int:
+    """Add n to the counter atomically and return its old value; no two threads get the same n numbers."""
+    counter[0] += n
+    return int(counter[0]) - n
 
 
-@register_lowering(fetch_and_increment)
-def _fetch_and_increment(typing: Any, taken: Any) -> Any:
+@register_lowering(fetch_and_add)
+def _fetch_and_add(typing: Any, counter: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        counter = context.make_array(taken)(context, builder, args[0]).data
-        return builder.atomic_rmw("add", counter, ir.IntType(64)(1), "monotonic")
+        data = context.make_array(counter)(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, args[1], "monotonic")
 
-    return types.int64(taken), generate
+    return types.int64(counter, types.int64), generate
 
 
 @scalar
 def dynamic_range(taken: Any, n_parts: int) -> Iterator[int]:
     """Yield the numbers below ``n_parts`` that no other thread has taken."""
-    part = fetch_and_increment(taken)
+    part = fetch_and_add(taken, 1)
     while part < n_parts:
         yield part
-        part = fetch_and_increment(taken)
+        part = fetch_and_add(taken, 1)

@@ -293,7 +293,7 @@ def bare(rng):
             tracer, ones = tracer_for(gaussians, conventions, backend), np.ones((len(gaussians.means), 3))
             blended = tracer.blend(ones, rays, BLACK, conventions)
             v = tracer.blend_vjp(ones, rays, BLACK, conventions, blended, (blended.image, rays.near, rays.near))
-            assert all(np.isfinite(array).all() for array in (*blended, *v))
+            assert all(np.isfinite(array).all() for array in (*blended[:5], *v))
             images.append((1 - blended.transmittances).reshape(18, 24))
         assert_allclose(images[0], images[1], atol=PARITY_FLOAT64)
         return images[0]

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from minisplat_ref.jit.compile import kernel, n_threads, prange
-from minisplat_ref.jit.scheduling import dynamic_range, fetch_and_increment, make_shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, fetch_and_add, make_shared_counter
 
 
 @kernel()
@@ -25,6 +25,6 @@ def test_every_part_is_taken_once(n_parts):
 
 def test_python_takes_the_same_parts():
     taken = make_shared_counter()
-    assert fetch_and_increment(taken) == 0
+    assert fetch_and_add(taken, 1) == 0
     assert list(dynamic_range(taken, 4)) == [1, 2, 3]
     assert list(dynamic_range(taken, 4)) == []

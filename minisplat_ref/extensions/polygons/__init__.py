@@ -1,4 +1,4 @@
-"""Flat Gaussians carried by polygons: traced as triangles, edited as a mesh, carried back.
+"""Flat Gaussians carried by polygons: traced by rays, edited as a mesh, carried back.
 
 This follows REdiSplats, Byrski et al. 2025, arXiv 2503.12284. A flat Gaussian with the axes e_a, e_b and the standard
 deviations s_a, s_b lies in a regular polygon of n = 8 sides (``mechanisms.meshes.fans``), whose radius depends on the
@@ -6,14 +6,14 @@ opacity o:
 
     x_j = mu + r (s_a cos phi_j e_a + s_b sin phi_j e_b),   phi_j = 2 pi j / n,   r^2 = max(0, 11.3449 + 2 ln o)
 
-The ray of each pixel hits the triangles between the centre and two neighbouring corners, and takes alpha where it does:
+The ray of each pixel takes alpha where it hits the polygon:
 
     alpha = min(alpha_max, o exp(-(u^2 + v^2) / 2))      (u, v): the place in the plane, in standard deviations
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
-(``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with eight triangles per Gaussian instead of one
-ellipsoid. The kernels intersect triangles with corners (:mod:`.kernels`), the reference planes bounded by half-planes
-(:mod:`.reference`), so that the two derivations share nothing.
+(``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with a polygon instead of an ellipsoid
+(:mod:`.ray_kernels`, in NumPy :mod:`.reference`). An edited polygon may be bent, and then the triangles between its
+centre and two neighbouring corners are what a ray hits (:mod:`.kernels`); of a flat one, both give the same hits.
 
 A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The corners of an edited polygon are fitted by
 spans, whose ellipse is the Gaussian. Every affine edit is carried exactly.

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.polygons.kernels import RESPONSE, Fans, tree_of
+from minisplat_ref.extensions.polygons.kernels import TRIANGLE, Fans, tree_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, soup_of
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
@@ -128,7 +128,7 @@ def render_soup(gaussians: Gaussians, soup: Soup, corners: Floats) -> Floats:
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits[soup.rows]))
     fans = Fans(centres, corners - centres[:, None], soup.radii, opacities)
     colors = np.maximum(0, 0.5 + SH_C0 * gaussians.sh_dc[soup.rows])
-    tracer = tracer_of(RESPONSE, tree_of(fans, GSPLAT_MAIN))
+    tracer = tracer_of(TRIANGLE, tree_of(fans, GSPLAT_MAIN))
     return tracer.blend(colors, pixel_rays(camera(), GSPLAT_MAIN), np.ones(3), GSPLAT_MAIN).image.reshape(SIZE, SIZE, 3)
 
 

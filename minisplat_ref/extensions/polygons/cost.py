@@ -1,7 +1,7 @@
-"""What the study ``polygons/cost`` measures: hits, triangles, and time of one processor for a pixel.
+"""What the study ``polygons/cost`` measures: hits, and time of one processor for a pixel.
 
 The same flat Gaussians are drawn as polygons, as ellipsoids that rays trace, and as splats, by the plain kernels and by
-the tuned ones. Splats are looked at for every pixel of a tile that they may touch; ellipsoids and triangles, where a
+the tuned ones. Splats are looked at for every pixel of a tile that they may touch; ellipsoids and polygons, where a
 ray comes near their boxes.
 """
 
@@ -15,8 +15,8 @@ from minisplat_ref.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.polygons.geometry import polygons_of
-from minisplat_ref.extensions.polygons.kernels import fans_of, tree_of
 from minisplat_ref.extensions.polygons.method import TRACED
+from minisplat_ref.extensions.polygons.ray_kernels import tree_of
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import table_of
@@ -67,9 +67,8 @@ def measure(n: int, repeats: int) -> dict[str, dict[str, float | None]]:
     }
     found = {name: _row(renderer, backend, gaussians, view, repeats) for name, (renderer, backend) in ways.items()}
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    fans = fans_of(polygons_of(gaussians, opacities))
-    found["polygons"]["triangles in the tree"] = float(len(tree_of(fans, GSPLAT_MAIN).records))
-    found["polygons"]["tree ms"] = 1e3 * kit.min_seconds(partial(tree_of, fans, GSPLAT_MAIN), repeats)
+    polygons = polygons_of(gaussians, opacities)
+    found["polygons"]["tree ms"] = 1e3 * kit.min_seconds(partial(tree_of, polygons, GSPLAT_MAIN), repeats)
     found["polygons"]["error of float32"] = _error(gaussians, view)
     return found
 
@@ -88,7 +87,6 @@ def _row(
     return {
         "hits a pixel": float(stats.hit_count.sum() / n_pixels),
         "looked at a pixel": looked_at,
-        "triangles in the tree": None,
         "tree ms": None,
         "forward us": 1e6 * forward / n_pixels,
         "backward us": 1e6 * backward / n_pixels,

@@ -5,7 +5,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
-from minisplat_ref.extensions.polygons.kernels import RESPONSE, fans_of, tree_of
+from minisplat_ref.extensions.polygons.ray_kernels import POLYGON, tree_of
 from minisplat_ref.extensions.polygons.reference import prepare_meeting
 from minisplat_ref.mechanisms.meshes.fans import turn_balls
 from minisplat_ref.mechanisms.rays import blending, kernels
@@ -19,9 +19,9 @@ LOG_THICKNESS = float(np.log(1e-5))  # of the axis across, as in the paper; what
 
 
 def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -> Tracer:
-    """Return how a backend traces: every ray against every polygon, or kernels with a tree of all triangles."""
+    """Return how a backend traces: every ray against every polygon, or kernels with a tree of polygons."""
     if backend.is_compiled:
-        return kernels.tracer_of(RESPONSE, tree_of(fans_of(polygons), conventions))
+        return kernels.tracer_of(POLYGON, tree_of(polygons, conventions))
     return blending.tracer_of(prepare_meeting(polygons))
 
 

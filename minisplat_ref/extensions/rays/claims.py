@@ -188,8 +188,12 @@ def run_speed(args: argparse.Namespace) -> str:
     """Time a ray and a rasterised pixel."""
     found = speed(args.gaussians, args.repeats)
     table = markdown_table(["measure", "value"], [[name, f"{value:.3g}"] for name, value in found.items()])
-    tuned, plain = (found["ray forward us"] / found[f"{name} forward us"] for name in ("pixel", "plain pixel"))
-    text = f"A ray takes {tuned:.1f} times as long as a pixel of the tuned kernels, {plain:.1f} times a plain one."
+    both = {name: found[f"{name} forward us"] + found[f"{name} backward us"] for name in ("ray", "plain pixel", "pixel")}
+    tuned, plain = both["ray"] / both["pixel"], both["ray"] / both["plain pixel"]
+    text = (
+        f"Forward and backward, a ray takes {tuned:.1f} times as long as a pixel of the tuned kernels,"
+        f" {plain:.1f} times a plain one."
+    )
     return f"{table}\n\n{text}"
 
 

@@ -122,7 +122,7 @@ def blend_rays(
     np.add.at(depths, hits.ray_ids, hits.weights * hits.depths)
     is_seen = np.bincount(hits.gaussian_ids, minlength=meeting.n) > 0
     image += hits.transmittances[:, None] * background
-    return BlendedRays(image, depths, hits.transmittances, np.diff(hits.offsets), is_seen)
+    return BlendedRays(image, depths, hits.transmittances, np.diff(hits.offsets), is_seen, hits)
 
 
 def blend_rays_vjp(
@@ -152,7 +152,7 @@ def blend_rays_vjp(
         Derivatives with respect to the image [P, 3], the depths [P] and the transmittances [P].
     """
     v_image, v_depths, v_transmittances = v_blended
-    hits = list_hits(meeting, rays, conventions)
+    hits: Hits = blended.kept
     ray_ids, ids = hits.ray_ids, hits.gaussian_ids
     alphas = np.minimum(conventions.alpha_max, hits.unclamped)
     f = np.sum(v_image[ray_ids] * colors[ids], axis=1) + v_depths[ray_ids] * hits.depths

@@ -16,13 +16,15 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH
-from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, fetch_and_add, make_shared_counter
 from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree, empty_lists, finder, limits_of, ray_of
 from minisplat_ref.types import Floats, Ints
 
 RAYS_PER_PART = 64  # a multiple of eight
 GAUSSIANS_PER_PART = 32
+HITS_KEPT_PER_RAY = 64  # more than rays meet on average; memory that no hit needs is never touched
+HITS_KEPT_MAX = 1 << 24  # 470 MB
 
 
 class RayResponse(NamedTuple):
@@ -41,7 +43,6 @@ class RayResponse(NamedTuple):
 
 class _Kernels(NamedTuple):
     blend: Callable
-    list_hits: Callable
     differentiate_rays: Callable
     add_up: Callable
 
@@ -61,10 +62,34 @@ def goes_on(T, limits):
     return T > limits.transmittance_min or (T == limits.transmittance_min and not limits.stops_at_equality)
 
 
+class KeptHits(NamedTuple):
+    """The blended hits of rays, as forward found them: the gradient traces nothing again.
+
+    Ray r has ``n_hits[r]`` of them from ``starts[r]`` on, nearest first. Which rays come first depends on the threads.
+    """
+
+    starts: Ints
+    """[P]."""
+    rows: Ints
+    """[room] int32 of the tree."""
+    unclamped: Floats
+    """[room] alpha before the clamp."""
+    depths: Floats
+    """[room] t."""
+    weights: Floats
+    """[room] ``w = alpha T``."""
+
+
 class _HitGradient(NamedTuple):
-    unclamped: Floats  # [H]
-    depths: Floats  # [H]
+    unclamped: Floats  # [room]
+    depths: Floats  # [room]
     rays: Floats  # [P, 6] with respect to origins and directions
+
+
+class _HitsOfRows(NamedTuple):
+    offsets: Ints  # [N' + 1] of each row of the tree
+    hits: Ints  # [H] in the order of the rays
+    rays: Ints  # [H]
 
 
 class _RayCotangents(NamedTuple):
@@ -80,61 +105,47 @@ def _kernels_of(response: RayResponse) -> _Kernels:
     n_sums = 7 + n_shape
 
     @kernel()
-    def blend(tree, colors, rays, background, limits, n_threads, blended):
+    def blend(tree, colors, rays, background, limits, n_threads, blended, kept, used):
         n_rays = len(rays.near)
         taken = make_shared_counter()
         for _ in prange(n_threads):
             found = empty_lists(limits.capacity)
             image, depths, transmittances, n_hits, is_seen = blended
+            starts, kept_rows, kept_unclamped, kept_depths, kept_weights = kept
             for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
                 for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                     lane = r % WIDTH
                     if lane == 0:
                         find_hits(tree, rays, r, n_rays, limits, found)
                     n = found.counts[lane]
+                    start = fetch_and_add(used, n)
+                    is_kept = start + n <= len(kept_rows)
                     T, red, green, blue, depth, count = 1.0, 0.0, 0.0, 0.0, 0.0, 0
                     while count < n:
-                        alpha = min(limits.alpha_max, found.unclamped[lane, count])
+                        unclamped = found.unclamped[lane, count]
+                        alpha = min(limits.alpha_max, unclamped)
                         after = T * (1.0 - alpha)
                         if not goes_on(after, limits):
                             break
-                        weight, g = alpha * T, tree.gaussian_ids[found.rows[lane, count]]
+                        row = found.rows[lane, count]
+                        weight, g = alpha * T, tree.gaussian_ids[row]
                         red += weight * colors[g, 0]
                         green += weight * colors[g, 1]
                         blue += weight * colors[g, 2]
                         depth += weight * found.depths[lane, count]
                         is_seen[g] = True
+                        if is_kept:
+                            kept_rows[start + count], kept_unclamped[start + count] = row, unclamped
+                            kept_depths[start + count], kept_weights[start + count] = found.depths[lane, count], weight
                         T = after
                         count += 1
                     image[r, 0] = red + T * background[0]
                     image[r, 1] = green + T * background[1]
                     image[r, 2] = blue + T * background[2]
-                    depths[r], transmittances[r], n_hits[r] = depth, T, count
+                    depths[r], transmittances[r], n_hits[r], starts[r] = depth, T, count, start
 
     @kernel()
-    def list_all(tree, rays, limits, n_threads, hits):
-        """Write the hits with rows of the tree; ``hits.offsets`` tells how many each ray has."""
-        n_rays = len(rays.near)
-        taken = make_shared_counter()
-        for _ in prange(n_threads):
-            found = empty_lists(limits.capacity)
-            offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
-            for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
-                for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
-                    lane = r % WIDTH
-                    if lane == 0:
-                        find_hits(tree, rays, r, n_rays, limits, found)
-                    T, first = 1.0, offsets[r]
-                    for i in range(offsets[r + 1] - first):
-                        alpha = min(limits.alpha_max, found.unclamped[lane, i])
-                        ray_ids[first + i], rows[first + i] = r, found.rows[lane, i]
-                        unclamped[first + i], depths[first + i] = found.unclamped[lane, i], found.depths[lane, i]
-                        weights[first + i] = alpha * T
-                        T *= 1.0 - alpha
-                    transmittances[r] = T
-
-    @kernel()
-    def differentiate_rays(tree, colors, rays, limits, n_threads, hits, cotangents, v):
+    def differentiate_rays(tree, colors, rays, limits, n_threads, kept, n_hits, cotangents, v):
         """Write the gradient with respect to each hit and each ray, from the last hit to the first."""
         n_rays = len(rays.near)
         taken = make_shared_counter()
@@ -146,12 +157,12 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                     red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
                     for k in range(6):
                         v_rays[r, k] = 0.0
-                    for h in range(hits.offsets[r + 1] - 1, hits.offsets[r] - 1, -1):
-                        row = hits.gaussian_ids[h]
-                        g, weight, unclamped = tree.gaussian_ids[row], hits.weights[h], hits.unclamped[h]
+                    for h in range(kept.starts[r] + n_hits[r] - 1, kept.starts[r] - 1, -1):
+                        row = kept.rows[h]
+                        g, weight, unclamped = tree.gaussian_ids[row], kept.weights[h], kept.unclamped[h]
                         alpha = min(limits.alpha_max, unclamped)
                         v_dot_c = red * colors[g, 0] + green * colors[g, 1] + blue * colors[g, 2]
-                        v_dot_c += cotangents.depths[r] * hits.depths[h]
+                        v_dot_c += cotangents.depths[r] * kept.depths[h]
                         v_alpha = weight / alpha * v_dot_c - behind / (1.0 - alpha)
                         behind += weight * v_dot_c
                         v_unclamped[h] = v_alpha if unclamped <= limits.alpha_max else 0.0
@@ -164,44 +175,46 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                             v_rays[r, 3 + k] += of_direction[k]
 
     @kernel()
-    def add_up(tree, rays, n_threads, hits, groups, v_image, v, sums):
+    def add_up(tree, rays, n_threads, kept, groups, v_image, v, sums):
         """Add the gradient of each row up: mean, opacity, colour, shape."""
         n_rows = len(tree.gaussian_ids)
         taken = make_shared_counter()
-        order, offsets = groups
         for _ in prange(n_threads):
             for part in dynamic_range(taken, (n_rows + GAUSSIANS_PER_PART - 1) // GAUSSIANS_PER_PART):
                 for row in range(part * GAUSSIANS_PER_PART, min((part + 1) * GAUSSIANS_PER_PART, n_rows)):
                     for k in range(n_sums):
                         sums[row, k] = 0.0
-                    for i in range(offsets[row], offsets[row + 1]):
-                        h = order[i]
-                        r = hits.ray_ids[h]
-                        unclamped = hits.unclamped[h]
+                    for i in range(groups.offsets[row], groups.offsets[row + 1]):
+                        h, r = groups.hits[i], groups.rays[i]
+                        unclamped = kept.unclamped[h]
                         of_mean, _of_direction, of_shape = meet_vjp(
                             tree.records, row, ray_of(rays, r), unclamped, v.unclamped[h], v.depths[h]
                         )
                         for k in range(3):
                             sums[row, k] += of_mean[k]
-                            sums[row, 4 + k] += hits.weights[h] * v_image[r, k]
+                            sums[row, 4 + k] += kept.weights[h] * v_image[r, k]
                         sums[row, 3] += unclamped / tree.records[row, OPACITY] * v.unclamped[h]
                         for k in range(n_shape):
                             sums[row, 7 + k] += of_shape[k]
 
-    return _Kernels(blend, list_all, differentiate_rays, add_up)
+    return _Kernels(blend, differentiate_rays, add_up)
 
 
 @kernel(parallel=False)
-def _sort_by_row(rows, offsets, order):
-    """Write where the hits of each row of the tree are, in the order of the rays; ``offsets`` [N' + 1] are zeros."""
-    for row in rows:
-        offsets[row + 1] += 1
+def _sort_by_row(kept, n_hits, groups):
+    """Write which hits each row of the tree has, in the order of the rays; ``groups.offsets`` are zeros."""
+    offsets, hits, rays = groups
+    for r in range(len(n_hits)):
+        for h in range(kept.starts[r], kept.starts[r] + n_hits[r]):
+            offsets[kept.rows[h] + 1] += 1
     for row in range(len(offsets) - 1):
         offsets[row + 1] += offsets[row]
     place = offsets[:-1].copy()
-    for h in range(len(rows)):
-        order[place[rows[h]]] = h
-        place[rows[h]] += 1
+    for r in range(len(n_hits)):
+        for h in range(kept.starts[r], kept.starts[r] + n_hits[r]):
+            i = place[kept.rows[h]]
+            hits[i], rays[i] = h, r
+            place[kept.rows[h]] = i + 1
 
 
 def blend_rays(
@@ -218,18 +231,21 @@ def blend_rays(
     colors, rays, background, conventions
         As there.
     """
-    n = len(rays.near)
-    blended = BlendedRays(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, np.int64), np.zeros(tree.n, bool))
-    limits = limits_of(conventions, len(tree.gaussian_ids))
-    _kernels_of(response).blend(tree, _wide(colors), rays, _wide(background), limits, n_threads(), blended)
-    return blended
+    room = min(HITS_KEPT_PER_RAY * len(rays.near), HITS_KEPT_MAX)
+    return _blend(response, tree, (colors, background), rays, conventions, room)[0]
 
 
 def list_hits(response: RayResponse, tree: RayTree, rays: Rays, conventions: Conventions) -> Hits:
     """Return the blended hits of each ray: see :func:`minisplat_ref.mechanisms.rays.blending.list_hits`."""
-    counts = blend_rays(response, tree, np.zeros((tree.n, 3)), rays, np.zeros(3), conventions).n_hits
-    hits = _list_hits(response, tree, rays, conventions, counts)
-    return hits._replace(gaussian_ids=tree.gaussian_ids[hits.gaussian_ids].astype(np.int64))
+    black = np.zeros((tree.n, 3)), np.zeros(3)
+    blended = blend_rays(response, tree, black[0], rays, black[1], conventions)
+    kept = _kept_of(response, tree, rays, conventions, blended)
+    offsets = np.concatenate([[0], np.cumsum(blended.n_hits)])
+    ray_ids = np.repeat(np.arange(len(rays.near)), blended.n_hits)
+    places = np.arange(offsets[-1]) + (kept.starts - offsets[:-1])[ray_ids]
+    ids = tree.gaussian_ids[kept.rows[places]].astype(np.int64)
+    unclamped, depths, weights = kept.unclamped[places], kept.depths[places], kept.weights[places]
+    return Hits(offsets, ray_ids, ids, unclamped, depths, weights, blended.transmittances)
 
 
 def blend_rays_vjp(
@@ -244,38 +260,56 @@ def blend_rays_vjp(
 ) -> RayGradient:
     """Gradient of :func:`blend_rays`: see :func:`minisplat_ref.mechanisms.rays.blending.blend_rays_vjp`."""
     v_image, v_depths, v_transmittances = (_wide(v) for v in v_blended)
-    kernels, hits = _kernels_of(response), _list_hits(response, tree, rays, conventions, blended.n_hits)
-    behind = hits.transmittances * (v_image @ _wide(background) + v_transmittances)
-    n_hits, n_rays, n_rows = len(hits.ray_ids), len(rays.near), len(tree.gaussian_ids)
-    v = _HitGradient(np.empty(n_hits), np.empty(n_hits), np.empty((n_rays, 6)))
+    kernels, kept = _kernels_of(response), _kept_of(response, tree, rays, conventions, blended)
+    n_hits, n_rays, n_rows, room = blended.n_hits, len(rays.near), len(tree.gaussian_ids), len(kept.rows)
+    behind = blended.transmittances * (v_image @ _wide(background) + v_transmittances)
+    v = _HitGradient(np.empty(room), np.empty(room), np.empty((n_rays, 6)))
     cotangents, limits = _RayCotangents(v_image, v_depths, behind), limits_of(conventions, n_rows)
-    kernels.differentiate_rays(tree, _wide(colors), rays, limits, n_threads(), hits, cotangents, v)
-    order, offsets = np.empty(n_hits, np.int64), np.zeros(n_rows + 1, np.int64)
-    _sort_by_row(hits.gaussian_ids, offsets, order)
+    kernels.differentiate_rays(tree, _wide(colors), rays, limits, n_threads(), kept, n_hits, cotangents, v)
+    groups = _HitsOfRows(np.zeros(n_rows + 1, np.int64), *np.empty((2, int(n_hits.sum())), np.int64))
+    _sort_by_row(kept, n_hits, groups)
     sums, v_gaussians = np.empty((n_rows, 7 + response.n_shape)), np.zeros((tree.n, 7))
-    kernels.add_up(tree, rays, n_threads(), hits, (order, offsets), v_image, v, sums)
+    kernels.add_up(tree, rays, n_threads(), kept, groups, v_image, v, sums)
     np.add.at(v_gaussians, tree.gaussian_ids, sums[:, :7])
     return RayGradient(
         means=v_gaussians[:, :3],
         shapes=response.shapes_of(tree, sums[:, 7:]),
         opacities=v_gaussians[:, 3],
         colors=v_gaussians[:, 4:],
-        background=np.sum(hits.transmittances[:, None] * v_image, axis=0),
+        background=np.sum(blended.transmittances[:, None] * v_image, axis=0),
         origins=v.rays[:, :3],
         directions=v.rays[:, 3:],
     )
 
 
-def _list_hits(response: RayResponse, tree: RayTree, rays: Rays, conventions: Conventions, counts: Ints) -> Hits:
-    """Return the hits, ``counts`` [P] per ray, with rows of the tree instead of the population's."""
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    n_hits = int(offsets[-1])
-    ray_ids, rows = np.empty((2, n_hits), np.int64)
-    unclamped, depths, weights = np.empty((3, n_hits))
-    hits = Hits(offsets, ray_ids, rows, unclamped, depths, weights, np.empty(len(counts)))
-    limits = limits_of(conventions, len(tree.gaussian_ids))
-    _kernels_of(response).list_hits(tree, rays, limits, n_threads(), hits)
-    return hits
+def _blend(
+    response: RayResponse,
+    tree: RayTree,
+    shades: tuple[Floats, Floats],
+    rays: Rays,
+    conventions: Conventions,
+    room: int,
+) -> tuple[BlendedRays, int]:
+    """Return what the rays see, with their hits if these fit into ``room``, and the room that they need."""
+    n, (colors, background) = len(rays.near), (_wide(shade) for shade in shades)
+    blended = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, np.int64), np.zeros(tree.n, bool)
+    kept = KeptHits(np.empty(n, np.int64), np.empty(room, np.int32), *(np.empty(room) for _ in range(3)))
+    limits, used = limits_of(conventions, len(tree.gaussian_ids)), np.zeros(1, np.int64)
+    _kernels_of(response).blend(tree, colors, rays, background, limits, n_threads(), blended, kept, used)
+    n_used = int(used[0])
+    return BlendedRays(*blended, kept if n_used <= room else None), n_used
+
+
+def _kept_of(
+    response: RayResponse, tree: RayTree, rays: Rays, conventions: Conventions, blended: BlendedRays
+) -> KeptHits:
+    """Return the hits of rays that were blended; where there was no room for them, by tracing once more."""
+    if blended.kept is not None:
+        kept: KeptHits = blended.kept
+        return kept
+    black = np.zeros((tree.n, 3)), np.zeros(3)
+    room = _blend(response, tree, black, rays, conventions, 0)[1]
+    return _kept_of(response, tree, rays, conventions, _blend(response, tree, black, rays, conventions, room)[0])
 
 
 def _wide(array: Floats) -> Floats:

@@ -5,7 +5,7 @@ All floats are float64: a thin Gaussian far away leaves float32 no digit of its 
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,6 +59,8 @@ class BlendedRays(NamedTuple):
     """[P] number of blended hits."""
     is_seen: Bools
     """[N] whether any ray has blended the Gaussian."""
+    kept: Any = None
+    """The hits in a form of the tracer's own; ``None`` if there was no room for them."""
 
 
 class RayGradient(NamedTuple):

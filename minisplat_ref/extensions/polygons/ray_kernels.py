@@ -1,0 +1,120 @@
+"""One ray and one polygon as kernels read them, and the tree of a population: the formulas of :mod:`.reference`.
+
+A polygon is tested as a whole: one plane, and the half-planes of its n edges, whose normals follow from each other by a
+rotation of ``2 pi / n``. Its triangles, eight times as many rows for an octagon, are needed once a mesh was edited
+(:mod:`.kernels`), when no plane is left.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.extensions.polygons.geometry import Polygons
+from minisplat_ref.extensions.polygons.kernels import cross, dot, fans_of
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import maximum, select
+from minisplat_ref.mechanisms.rays.bvh import build
+from minisplat_ref.mechanisms.rays.kernels import RayResponse
+from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
+from minisplat_ref.types import Floats
+
+N_SIDES, INNER = 1, 2  # columns of a record beside the opacity: n, and r cos(pi / n), from the centre to an edge
+FIRST, TURN = 3, 5  # cosine and sine of pi / n, of the first edge's normal, and of 2 pi / n
+CENTRE, SPAN_A, SPAN_B, U, V, NORMAL = 7, 10, 13, 16, 19, 22  # U = S_a / |S_a|^2, V = S_b / |S_b|^2, n = S_a x S_b
+N_COLUMNS = 25
+
+
+def tree_of(polygons: Polygons, conventions: Conventions) -> RayTree:
+    """Return the polygons with their tree; those that are too faint, empty or not finite are left out."""
+    fans, n = fans_of(polygons), polygons.n_sides
+    corners = fans.centres[:, None] + fans.spokes  # [N, n, 3]
+    is_seen = (polygons.radii > 0) & (polygons.opacities >= max(conventions.alpha_min, np.finfo(np.float64).tiny))
+    with np.errstate(over="ignore"):
+        squares = np.sum(polygons.spans**2, axis=1)  # [N, 2]
+    seen = np.flatnonzero(is_seen & np.isfinite(corners).all(axis=(1, 2)) & (squares > 0).all(axis=1))
+    tree = build(corners[seen].min(axis=1), corners[seen].max(axis=1))
+    ids = seen[tree.rows]
+    S_a, S_b = polygons.spans[ids, :, 0], polygons.spans[ids, :, 1]
+    records = np.empty((len(ids), N_COLUMNS))
+    records[:, OPACITY] = polygons.opacities[ids]
+    records[:, N_SIDES] = n
+    records[:, INNER] = polygons.radii[ids] * np.cos(np.pi / n)
+    records[:, FIRST:CENTRE] = [np.cos(np.pi / n), np.sin(np.pi / n), np.cos(2 * np.pi / n), np.sin(2 * np.pi / n)]
+    records[:, CENTRE:SPAN_A] = polygons.means[ids]
+    records[:, SPAN_A:SPAN_B] = S_a
+    records[:, SPAN_B:U] = S_b
+    records[:, U:V] = S_a / squares[ids, :1]
+    records[:, V:NORMAL] = S_b / squares[ids, 1:]
+    records[:, NORMAL:] = np.cross(S_a, S_b)
+    parts = np.zeros(len(ids), np.int32)
+    return RayTree(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(polygons.means))
+
+
+@scalar
+def vector(records, row, column):
+    """Return three columns of a record."""
+    return records[row, column], records[row, column + 1], records[row, column + 2]
+
+
+@scalar
+def intersect(records, row, ray):
+    """Return t, x from the centre to the hit, u and v of one ray or of eight."""
+    o, d, n = (ray[0], ray[1], ray[2]), (ray[3], ray[4], ray[5]), vector(records, row, NORMAL)
+    m = records[row, CENTRE] - o[0], records[row, CENTRE + 1] - o[1], records[row, CENTRE + 2] - o[2]
+    t = dot(m, n) / dot(d, n)
+    x = t * d[0] - m[0], t * d[1] - m[1], t * d[2] - m[2]
+    return t, x, dot(x, vector(records, row, U)), dot(x, vector(records, row, V))
+
+
+@scalar
+def meet(records, row, ray):
+    """Return t and ``q = u^2 + v^2`` of eight rays; q is infinite beyond an edge."""
+    t, _, u, v = intersect(records, row, ray)
+    cosine, sine = records[row, FIRST], records[row, FIRST + 1]
+    outermost = u * cosine + v * sine
+    for _ in range(int(records[row, N_SIDES]) - 1):
+        cosine, sine = (
+            cosine * records[row, TURN] - sine * records[row, TURN + 1],
+            sine * records[row, TURN] + cosine * records[row, TURN + 1],
+        )
+        outermost = maximum(outermost, u * cosine + v * sine)
+    return t, select(outermost <= records[row, INNER], u * u + v * v, np.inf)
+
+
+@scalar
+def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
+    """Return the gradient with respect to the centre, the direction and both spans [6]; see the reference's chain."""
+    t, x, u, v = intersect(records, row, ray)
+    d, n = (ray[3], ray[4], ray[5]), vector(records, row, NORMAL)
+    S_a, S_b, U_a, V_b = (
+        vector(records, row, SPAN_A),
+        vector(records, row, SPAN_B),
+        vector(records, row, U),
+        vector(records, row, V),
+    )
+    v_u, v_v = -unclamped * u * v_unclamped, -unclamped * v * v_unclamped
+    v_x = v_u * U_a[0] + v_v * V_b[0], v_u * U_a[1] + v_v * V_b[1], v_u * U_a[2] + v_v * V_b[2]
+    w = (v_t + dot(v_x, d)) / dot(n, d)
+    v_m = w * n[0] - v_x[0], w * n[1] - v_x[1], w * n[2] - v_x[2]
+    v_n = -w * x[0], -w * x[1], -w * x[2]
+    p, q = v_u / dot(S_a, S_a), v_v / dot(S_b, S_b)
+    of_a, of_b = cross(S_b, v_n), cross(v_n, S_a)
+    v_spans = (
+        p * (x[0] - 2.0 * u * S_a[0]) + of_a[0],
+        p * (x[1] - 2.0 * u * S_a[1]) + of_a[1],
+        p * (x[2] - 2.0 * u * S_a[2]) + of_a[2],
+        q * (x[0] - 2.0 * v * S_b[0]) + of_b[0],
+        q * (x[1] - 2.0 * v * S_b[1]) + of_b[1],
+        q * (x[2] - 2.0 * v * S_b[2]) + of_b[2],
+    )
+    return v_m, (-t * v_m[0], -t * v_m[1], -t * v_m[2]), v_spans
+
+
+def _spans_of(tree: RayTree, v_rows: Floats) -> Floats:
+    """Return the gradient of the spans [N, 3, 2] from those of the rows [N', 6], each of which is one polygon."""
+    v: Floats = np.zeros((tree.n, 3, 2))
+    v[tree.gaussian_ids] = np.swapaxes(v_rows.reshape(-1, 2, 3), 1, 2)
+    return v
+
+
+POLYGON = RayResponse(meet, meet_vjp, 6, _spans_of)
+"""A flat Gaussian in its polygon."""
