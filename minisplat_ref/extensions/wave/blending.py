@@ -8,10 +8,10 @@ plane of its own centre, with its peak at 1; o its opacity, c its amplitude; P p
 T is a mask: it hides what is straight behind, and does not diffract. *Fast* blending takes for T one number per
 Gaussian, the transmittance at its centre, so that everything is one sum of closed forms over Gaussians:
 
-    U = sum_i t_i o_i c_i G_i,   t_i = prod_(j before i) (1 - o_j exp(-d^T C_j^-1 d / 2)),   d = the centre of i from j's
+    U = sum_i t_i o_i c_i G_i,   t_i = prod_(j before i) (1 - o_j exp(-d^T C_j^-1 d / 2)),   d = (c_i - c_j)_xy
 
-with C the covariance of the image. The *silhouette* method goes back to front: the light that arrives from behind
-passes through each Gaussian and its own is added,
+with C the covariance of the image along z. The *silhouette* method goes back to front: the light that arrives from
+behind passes through each Gaussian and its own is added,
 
     U <- P[U] (1 - o_i |u_i|) + o_i c_i u_i
 
@@ -63,7 +63,8 @@ def blend(scene: Scene, grid: Grid, wavelength: float, channel: int) -> Complexe
 def blend_silhouettes(scene: Scene, grid: Grid, wavelength: float, channel: int) -> Complexes:
     """Return the hologram [H, W] of one channel by the silhouette method."""
     waves = grid_waves(grid, wavelength)
-    total, at = np.zeros((2 * grid.height, 2 * grid.width), np.complex128), 0.0
+    total: Complexes = np.zeros((2 * grid.height, 2 * grid.width), np.complex128)
+    at = 0.0
     for i, z in reversed(list(enumerate(scene.flats.centers[:, 2]))):
         u = _field_of(scene.flats, i, waves, grid)
         arriving = field_from(total * transfer(waves, grid, z - at), waves, grid)
@@ -96,6 +97,5 @@ def _field_of(flats: Flats, i: int, waves: Waves, grid: Grid) -> Complexes:
 
 
 def _spectrum_of(flats: Flats, i: int, waves: Waves, z: float) -> Complexes:
-    one = Flats(*(field[i : i + 1] for field in flats))
-    flat_waves = waves._replace(k=waves.k.reshape(-1, 3))
-    return spectra(one, flat_waves, z).reshape(waves.k.shape[:-1])
+    listed = waves._replace(k=waves.k.reshape(-1, 3))
+    return spectra(flats.one(i), listed, z).reshape(waves.k.shape[:-1])

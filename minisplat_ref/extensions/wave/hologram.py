@@ -45,7 +45,7 @@ example:
   minisplat-ref wave focus fox.npz --depth 3.5 --out near.png
 """
 WAVELENGTHS = (638.0, 520.0, 450.0)  # nm, of lasers in displays
-PITCH, THICKNESS = 8.0, 20.0  # um, mm
+PITCH, THICKNESS = 8.0, 4.0  # um, mm
 BYTES = 16 * 8  # per pixel of the padded grid, at the peak: complex fields, spectra, transfer functions, frequencies
 
 Blend = Callable[[Scene, Grid, float, int], Complexes]
@@ -79,8 +79,10 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--camera", metavar="NAME", help="of the image (default: the first test view)")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: beside the PLY)")
     parser.add_argument("--pitch", type=positive, default=PITCH, metavar="UM", help="of the display, um (default 8)")
-    parser.add_argument("--width", type=positive, metavar="MM", help="of the display, mm (default: the camera's pixels)")
-    parser.add_argument("--thickness", type=positive, default=THICKNESS, metavar="MM", help="of the box (default 20)")
+    parser.add_argument("--width", type=positive, metavar="MM", help="of the display, mm (default: that of its image)")
+    parser.add_argument(
+        "--thickness", type=positive, default=THICKNESS, metavar="MM", help="depth of the box, mm (default 4)"
+    )
     parser.add_argument(
         "--wavelengths", type=list_of(positive), default=WAVELENGTHS, metavar="R,G,B", help="nm (default 638,520,450)"
     )

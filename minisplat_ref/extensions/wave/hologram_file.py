@@ -1,7 +1,7 @@
 """A hologram as an .npz: one complex field for each colour, and what is needed to look at it."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,12 +49,11 @@ def save(path: Path, hologram: Hologram) -> None:
     InputError
         It cannot be written.
     """
-    values = (
-        *(np.asarray(part, np.float32) for part in (hologram.fields.real, hologram.fields.imag)),
-        *(np.asarray(value, np.float64) for value in hologram[1:]),
-    )
+    fields = hologram.fields.astype(np.complex64)
+    values = (fields.real, fields.imag, *map(np.asarray, hologram[1:]))
+    arrays: dict[str, Any] = dict(zip(NAMES, values, strict=True))
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **dict(zip(NAMES, values, strict=True)))
+        np.savez(file, **arrays)
 
 
 def load(path: Path) -> Hologram:

@@ -43,6 +43,10 @@ class Flats(NamedTuple):
         spans = self.axes[:, :2, :2] * self.scales[:, None, :]
         return spans @ np.swapaxes(spans, 1, 2)
 
+    def one(self, i: int) -> "Flats":
+        """Return one of them."""
+        return Flats(*(field[i : i + 1] for field in self))
+
 
 class FlatsGradient(NamedTuple):
     """Gradient of the loss with respect to flat Gaussians and their amplitudes."""
@@ -91,7 +95,7 @@ def spectra(flats: Flats, waves: Waves, z: float | Floats = 0.0) -> Complexes:
     """
     k, wavelength = waves
     q = k - [0, 0, 1 / wavelength]
-    u, v, nk = np.moveaxis(_along_axes(flats, q, k), 2, 0)  # [N, P] each
+    u, v, nk = _along_axes(flats, q, k)  # [N, P] each
     s_1, s_2 = flats.scales.T[:, :, None]
     cx, cy, cz = flats.centers.T[:, :, None]
     z = np.reshape(z, (-1, 1))
@@ -129,7 +133,7 @@ def spectrum_vjp(flats: Flats, amplitudes: Floats, waves: Waves, z: float, v_spe
     """
     k, wavelength = waves
     q = k - [0, 0, 1 / wavelength]
-    u, v, nk = np.moveaxis(_along_axes(flats, q, k), 2, 0)
+    u, v, nk = _along_axes(flats, q, k)
     weighted = np.conj(v_spectrum) * spectra(flats, waves, z)  # [N, P] for amplitude 1
     g, h = amplitudes[:, None] * weighted.real, amplitudes[:, None] * weighted.imag
     s_1, s_2 = flats.scales.T
@@ -149,10 +153,9 @@ def spectrum_vjp(flats: Flats, amplitudes: Floats, waves: Waves, z: float, v_spe
 
 
 def _along_axes(flats: Flats, q: Floats, k: Floats) -> Floats:
-    """Return u, v and ``n . k`` [N, P, 3]."""
-    return np.stack([q @ flats.axes[:, :, 0].T, q @ flats.axes[:, :, 1].T, k @ flats.axes[:, :, 2].T], axis=-1).swapaxes(
-        0, 1
-    )
+    """Return u, v and ``n . k`` [3, N, P]."""
+    e_1, e_2, n = np.moveaxis(flats.axes, 2, 0)  # [N, 3] each
+    return np.stack([e_1 @ q.T, e_2 @ q.T, n @ k.T])
 
 
 def rayleigh_sommerfeld(flats: Flats, places: Floats, wavelength: float, n: int = 240, reach: float = 5.0) -> Complexes:

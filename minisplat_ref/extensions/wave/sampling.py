@@ -73,7 +73,8 @@ def spectrum_from(field: Complexes, waves: Waves, grid: Grid) -> Complexes:
 
 
 def _shift(waves: Waves, grid: Grid) -> Complexes:
-    return np.exp(2j * np.pi * (waves.k[..., 0] * grid.x[0] + waves.k[..., 1] * grid.y[0]))
+    phases = 2j * np.pi * np.array([grid.x[0], grid.y[0]])
+    return np.exp(phases[0] * waves.k[:1, :, 0]) * np.exp(phases[1] * waves.k[:, :1, 1])
 
 
 def transfer(waves: Waves, grid: Grid, dz: float) -> Complexes:

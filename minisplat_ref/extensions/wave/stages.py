@@ -18,7 +18,7 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
     """Return the spectrum of tilted Gaussians in the plane z; it is NumPy on every backend."""
     fx, fy = rng.uniform(-0.4, 0.4, size=(2, 12))
     waves = waves_of(fx, fy, WAVELENGTH)
-    inputs = {
+    inputs: dict[str, Floats] = {
         "centers": rng.uniform(-0.6, 0.6, size=(N, 3)),
         "quats": np.array([1.0, 0, 0, 0]) + 0.3 * rng.normal(size=(N, 4)),
         "scales": rng.uniform(0.4, 0.9, size=(N, 2)),

@@ -9,21 +9,20 @@ The silhouette method does the same plane by plane from the back, with a transmi
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
 
 from minisplat_ref.extensions.wave.blending import Scene, alphas_of
-from minisplat_ref.extensions.wave.reference import Complexes, Flats, spectra, waves_of
+from minisplat_ref.extensions.wave.kernels import sum_spectra
+from minisplat_ref.extensions.wave.reference import Complexes, Flats, waves_of
 from minisplat_ref.extensions.wave.sampling import Grid, field_from, grid_waves, spectrum_from, transfer
 from minisplat_ref.types import Floats, Ints
 
 N_PLANES = 64
 REACH = 4.5  # standard deviations from the centre of a window to its side: exp(-REACH^2 / 2) = 4e-5
 MARGIN = 4  # pixels besides, for what diffraction spreads on the way to the nearest plane
-Progress = Callable[[range], "range"]
 
 
 class Window(NamedTuple):
@@ -58,23 +57,21 @@ def planes_of(z: Floats, n: int = N_PLANES) -> Planes:
     return Planes(planes, np.rint((planes[0] - z) / step).astype(np.int64))
 
 
-def window_of(flats: Flats, i: int, grid: Grid) -> Window:
+def window_of(one: Flats, grid: Grid) -> Window:
     """Return the window of a Gaussian."""
-    center, halves = flats.centers[i, :2], REACH * np.sqrt(np.diag(flats.lateral_covariances[i])) / grid.pitch + MARGIN
+    center, halves = one.centers[0, :2], REACH * np.sqrt(np.diag(one.lateral_covariances[0])) / grid.pitch + MARGIN
     width, height = (scipy.fft.next_fast_len(2 * math.ceil(half)) for half in halves)
     column, row = np.rint(center / grid.pitch + [grid.width / 2, grid.height / 2]).astype(int)
     return Window(int(column) - width // 2, int(row) - height // 2, width, height)
 
 
-def field_in(window: Window, flats: Flats, i: int, grid: Grid, wavelength: float, z: float) -> Complexes:
+def field_in(window: Window, one: Flats, grid: Grid, wavelength: float, z: float) -> Complexes:
     """Return the field of a Gaussian in the plane z on its window."""
     fx, fy = (scipy.fft.fftfreq(n, grid.pitch) for n in (window.width, window.height))
     waves = waves_of(fx[None, :], fy[:, None], wavelength)
-    one = Flats(*(field[i : i + 1] for field in flats))
     first = np.array([window.left + 0.5 - grid.width / 2, window.top + 0.5 - grid.height / 2]) * grid.pitch
-    one = one._replace(centers=one.centers - [*first, 0])  # as seen from the window's first pixel
-    spectrum = spectra(one, waves._replace(k=waves.k.reshape(-1, 3)), z).reshape(window.height, window.width)
-    return scipy.fft.ifft2(spectrum) / grid.pitch**2
+    seen = one._replace(centers=one.centers - [*first, 0])  # from the window's first pixel
+    return scipy.fft.ifft2(sum_spectra(seen, np.ones(1), waves, z)) / grid.pitch**2
 
 
 def blend_windows(scene: Scene, grid: Grid, wavelength: float, channel: int, n_planes: int = N_PLANES) -> Complexes:
@@ -108,7 +105,8 @@ def blend_silhouette_windows(
     """Return the hologram [H, W] of one channel by the silhouette method; as :func:`blend_windows`."""
     planes = planes_of(scene.flats.centers[:, 2], n_planes)
     waves = grid_waves(grid, wavelength)
-    total, at = np.zeros((2 * grid.height, 2 * grid.width), np.complex128), 0.0
+    total: Complexes = np.zeros((2 * grid.height, 2 * grid.width), np.complex128)
+    at = 0.0
     for plane, z in reversed(list(enumerate(planes.z))):
         T = np.ones((grid.height, grid.width))
         light = _blend_plane(scene, planes, plane, grid, wavelength, channel, T)
@@ -128,9 +126,10 @@ def _blend_plane(
         return None
     light = np.zeros(T.shape, np.complex128)
     for i in range(first, end):
-        window = window_of(scene.flats, i, grid)
+        one = scene.flats.one(i)
+        window = window_of(one, grid)
         there, here = window.inside(grid)
-        u = field_in(window, scene.flats, i, grid, wavelength, float(planes.z[plane]))[here]
+        u = field_in(window, one, grid, wavelength, float(planes.z[plane]))[here]
         light[there] += T[there] * (scene.opacities[i] * scene.amplitudes[i, channel]) * u
         T[there] *= 1 - alphas_of(scene.opacities[i], u)
     return light
