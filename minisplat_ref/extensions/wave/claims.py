@@ -125,10 +125,10 @@ _AT = USUAL, GREEN_LIGHT, -1e-3  # the plane of what is behind the screen
 
 def at_an_edge() -> dict[str, Floats]:
     """Return by way the image [H, W] of a wall of Gaussians, in focus, behind a screen on the left."""
-    rows, columns = (g.ravel() for g in np.meshgrid(np.arange(-8, 9), np.arange(-8, 9), indexing="ij"))
-    wall = np.column_stack([columns * 5e-5, rows * 5e-5, np.full(len(rows), -1e-3)])
+    rows, columns = (g.ravel() for g in np.meshgrid(np.arange(-4, 5), np.arange(-4, 5), indexing="ij"))
+    wall = np.column_stack([columns * 1e-4, rows * 1e-4, np.full(len(rows), -1e-3)])
     screen = wall[columns < 0] + [0, 0, 2e-3]
-    flats = facing(np.concatenate([screen, wall]), np.full(len(screen) + len(wall), 2.5e-5))
+    flats = facing(np.concatenate([screen, wall]), np.full(len(screen) + len(wall), 5e-5))
     is_wall = np.arange(len(flats.centers)) >= len(screen)
     amplitudes = np.where(is_wall, 1.0, 0.0)[:, None] * np.ones(3)
     scene = front_to_back(Scene(flats, np.full(len(is_wall), 0.95), amplitudes))
