@@ -30,7 +30,8 @@ def run(tmp_path_factory):
     g.log_scales[:, 2] = -12
     save_ply(folder / "point_cloud.ply", as_dtype(g, np.float32), SURFELS)
     away = CAMERA._replace(cam_from_world_R=np.diag([-1.0, 1.0, -1.0]))
-    named = [("front", CAMERA, "train"), ("test", CAMERA, "test"), ("away", away, "train")]
+    beside = CAMERA._replace(cam_from_world_t=np.array([0.2, 0.0, 0.0]))
+    named = [("beside", beside, "train"), ("test", CAMERA, "test"), ("away", away, "train")]
     views = [Viewpoint(name, camera, split) for name, camera, split in named]
     (folder / "cameras.json").write_text(json.dumps(viewpoints.to_json(views)))
     return folder
@@ -63,6 +64,13 @@ def test_a_hologram_has_what_is_needed_to_look_at_it(hologram, run):
     assert phases.shape == (32, 48, 3) and phases.std() > 20
 
 
+def test_a_camera_is_chosen_by_its_name(hologram, run, tmp_path):
+    out = tmp_path / "beside.npz"
+    assert main(["wave", "hologram", str(run), "--camera", "beside", "--out", str(out)]) == 0
+    default, beside = (np.abs(hologram_file.load(path).fields) for path in (hologram, out))
+    assert np.abs(default - beside).mean() > 0.05
+
+
 def test_with_everything_in_focus_it_is_the_image(run, tmp_path):
     """A box that is thinner than a wavelength: the absolute values are what 3DGS draws, but for what is flat."""
     out, image = tmp_path / "thin.npz", tmp_path / "image.png"
@@ -85,13 +93,13 @@ def test_focus_changes_the_image_and_phases_alone_resemble_it(hologram, tmp_path
         images[name] = read_image(out) / 255
     assert 0.02 < np.sqrt(np.mean((images["near"] - images["far"]) ** 2)) < 0.3
     correlations = [np.corrcoef(images["phase"].ravel(), images[name].ravel())[0, 1] for name in ("near", "far")]
-    assert 0.7 < correlations[0] < 0.999 and correlations[1] < correlations[0]
+    assert 0.6 < correlations[0] < 0.999 and correlations[1] < correlations[0]
 
 
 @pytest.mark.parametrize("blending", ["fast", "silhouette"])
 def test_other_blending_resembles_exact_blending(blending, hologram, run, tmp_path):
     out = tmp_path / "other.npz"
-    assert main(["wave", "hologram", str(run), "--camera", "front", "--blending", blending, "--out", str(out)]) == 0
+    assert main(["wave", "hologram", str(run), "--camera", "test", "--blending", blending, "--out", str(out)]) == 0
     exact, other = (np.abs(hologram_file.load(path).fields) for path in (hologram, out))
     assert 1e-4 < np.sqrt(np.mean((exact - other) ** 2)) < 0.5 * np.sqrt(np.mean(exact**2))
 
@@ -127,7 +135,7 @@ def test_a_scene_of_millimetres_gives_the_same_hologram(hologram, run, tmp_path)
     ("arguments", "message"),
     [
         (["--camera", "away"], "none of the 40 Gaussians is in front of the camera"),
-        (["--camera", "nobody"], "has no camera 'nobody': choose from front, test, away"),
+        (["--camera", "nobody"], "has no camera 'nobody': choose from beside, test, away"),
         (["--wavelengths", "520"], "give three in nm, of red, green and blue light"),
         (["--pitch", "1"], r"light of 638 nm leave so steeply .* a pitch of [\d.]+ um fits"),
         (
@@ -188,3 +196,15 @@ def test_the_study_measures_its_claims(tmp_path, capsys):
     assert all(found["shadow"] < 0.35 * found["light"] for found in edge.values())
     assert read_image(tmp_path / "study" / "figure.png").std() > 1
     assert "brightest planes of Gaussians at: +4.0 mm in +4.0" in capsys.readouterr().out
+
+
+def test_a_trained_scene_is_best_where_it_is_in_focus(run, tmp_path, capsys):
+    ply, out = run / "point_cloud.ply", tmp_path / "study"
+    assert main(["study", "wave/scene", str(ply), "--out", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text())
+    thirds = result["thirds"]
+    assert thirds["near"]["depth"] < thirds["middle"]["depth"] < thirds["far"]["depth"]
+    assert thirds["near"]["best focus"] < thirds["far"]["best focus"]
+    assert thirds["near"]["focused nearest"] > thirds["near"]["focused farthest"] + 1  # dB
+    assert result["psnr"]["in one plane"] > 20  # surfels have another low-pass
+    assert read_image(out / "figure.png").std() > 1

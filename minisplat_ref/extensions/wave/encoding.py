@@ -6,6 +6,9 @@ With the amplitude A in [0, 1] and the phase p, ``A exp(i p)`` is the mean of tw
 
 which neighbouring pixels show on a checkerboard. An aperture in the focal plane of the display, here of half the band
 on either axis, blurs them to their mean and holds back the copies that the checkerboard makes.
+
+The mean is right as far as neighbours have the same phase. Where the field is nearly black its phase is noise, which
+would light up; it is taken as 0 there, that of the wave along z in the display's plane.
 """
 
 import numpy as np
@@ -15,16 +18,18 @@ from minisplat_ref.extensions.wave.sampling import Grid, field_from, grid_waves,
 from minisplat_ref.types import Floats
 
 APERTURE = 0.5  # of the band
+BLACK = 1 / 255  # of the largest amplitude
 
 
 def encode(field: Complexes) -> tuple[Floats, float]:
     """Return the phases [H, W] in [0, 2 pi) of a field, and the amplitude that 1 stands for."""
     peak = float(np.abs(field).max()) or 1.0
-    half = np.arccos(np.minimum(np.abs(field) / peak, 1))
+    amplitudes = np.minimum(np.abs(field) / peak, 1)
+    half = np.arccos(amplitudes)
     rows, columns = np.indices(field.shape)
     signs = 1 - 2 * ((rows + columns) % 2)
-    phases: Floats = np.mod(np.angle(field) + signs * half, 2 * np.pi)
-    return phases, peak
+    phases: Floats = np.where(amplitudes < BLACK, 0, np.angle(field)) + signs * half
+    return np.mod(phases, 2 * np.pi), peak
 
 
 def decode(phases: Floats, peak: float, grid: Grid, wavelength: float) -> Complexes:

@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "focus",
         help="look at a hologram, focused on a depth",
-        description="Propagate a hologram to the plane of a depth of the scene, and write what is there.",
+        description="Propagate a hologram to the plane of a depth, and write what is there.",
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )

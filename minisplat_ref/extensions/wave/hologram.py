@@ -79,7 +79,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--camera", metavar="NAME", help="of the image (default: the first test view)")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: beside the PLY)")
     parser.add_argument("--pitch", type=positive, default=PITCH, metavar="UM", help="of the display, um (default 8)")
-    parser.add_argument("--width", type=positive, metavar="MM", help="of the display, mm (default: that of its image)")
+    parser.add_argument(
+        "--width", type=positive, metavar="MM", help="of the display, mm (default: a pixel per camera pixel)"
+    )
     parser.add_argument(
         "--thickness", type=positive, default=THICKNESS, metavar="MM", help="depth of the box, mm (default 4)"
     )

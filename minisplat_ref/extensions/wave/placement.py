@@ -35,7 +35,7 @@ from minisplat_ref.rendering import activate
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
 
 THICK = 0.5  # ratio of the least to the middle scale above which a Gaussian is no disc
-DEPTH_SHARE = 0.01  # of the Gaussians in view, that are nearer or farther than the ends of the box, each
+DEPTH_SHARE = 0.01  # of what is in view, by opacity and area, that is nearer or farther than the box, each
 
 
 class Box(NamedTuple):
@@ -108,7 +108,9 @@ def place(
     colors = sh_colors(
         seen.means, seen.sh_dc, seen.sh_rest, camera.astype(np.float64), degree, np.ones((len(in_camera), 2), int)
     )
-    box = _box_around(in_camera[:, 2], camera, width, thickness)
+    log_areas = seen.log_scales.sum(axis=1) - seen.log_scales.min(axis=1) - 2 * np.log(in_camera[:, 2])
+    weights = opacities[is_seen] * np.exp(log_areas - log_areas.max())
+    box = Box(camera, *_ends(in_camera[:, 2], weights), width, thickness)
     flats, n_steep = _flats_in(box, seen, in_camera, steepest, conventions.eps2d)
     ordered = np.sort(seen.log_scales, axis=1)
     n_thick = int(np.count_nonzero(ordered[:, 0] - ordered[:, 1] > math.log(THICK)))
@@ -131,12 +133,14 @@ def _is_seen(
     return is_seen & (np.abs(u) < camera.width / camera.fx) & (np.abs(v) < camera.height / camera.fy)
 
 
-def _box_around(depths: Floats, camera: Camera, width: float, thickness: float) -> Box:
-    """Return the box of depths that all but a share of the Gaussians are in."""
-    farthest, nearest = 1 / np.quantile(1 / depths, [DEPTH_SHARE, 1 - DEPTH_SHARE])
+def _ends(depths: Floats, weights: Floats) -> tuple[float, float]:
+    """Return the depths between which all but a share of the weight is, at either end."""
+    order = np.argsort(depths)
+    below = np.cumsum(weights[order]) / np.sum(weights)
+    nearest, farthest = depths[order][np.searchsorted(below, [DEPTH_SHARE, 1 - DEPTH_SHARE])].tolist()
     if not farthest > nearest:  # one depth: any range around it
-        nearest, farthest = 0.5 * nearest, 2 * farthest
-    return Box(camera, float(nearest), float(farthest), width, thickness)
+        return 0.5 * nearest, 2 * nearest
+    return nearest, farthest
 
 
 def _flats_in(box: Box, seen: Gaussians, in_camera: Floats, steepest: float, eps2d: float) -> tuple[Flats, int]:
