@@ -31,7 +31,8 @@ close to what a screen does. So with everything in focus the absolute values of 
 This deviates from the paper as follows. Exact blending of a whole scene is done in windows and 64 planes
 (:mod:`minisplat_ref.extensions.wave.windows`); without them it takes two transforms of the grid for each Gaussian. The
 fast approximation has one transmittance for each Gaussian, at its centre, instead of none. Slopes are bounded, because
-a Gaussian that is steeper than its own light would shine along its mirrored direction as well.
+a Gaussian that is steeper than its own light would shine along its mirrored direction as well. The low-pass is that of
+3DGS, for surfels too.
 
 Left out: training on holograms, random phases (they blur what is out of focus more, with speckle), and the paper's
 comparison by photographs of a display. There is nothing to train, so the gradients are those of the closed form.
