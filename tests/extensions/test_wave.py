@@ -195,6 +195,14 @@ def test_windows_are_the_same_blending(way, in_windows, rng):
     assert error < few < 0.2 * np.abs(exact).max()  # which is why there are 64 planes
 
 
+@pytest.mark.parametrize(("pixels", "error"), [(0.55, 0.02), (1.0, 0.001), (2.0, WAVE_WINDOW)])
+def test_windows_leave_out_the_ringing_of_narrow_gaussians(pixels, error):
+    """As the docstring promises."""
+    scene = Scene(facing([[3e-6, 2e-6, 5e-4]], [pixels * 8e-6]), np.ones(1), np.ones((1, 3)))
+    exact, in_window = (way(scene, GRID, LAMBDA, 0) for way in (blending.blend, windows.blend_windows))
+    assert np.abs(exact - in_window).max() < error
+
+
 def test_a_window_may_leave_the_grid():
     beside = facing([[-2.4e-4, 0, 0], [1e-2, 0, 0]], [2e-5, 2e-5])  # half outside; far outside
     field = windows.blend_windows(Scene(beside, np.ones(2), np.ones((2, 3))), GRID, LAMBDA, 0)

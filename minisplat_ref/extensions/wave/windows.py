@@ -5,8 +5,9 @@ centre a Gaussian is small. So here its spectrum is evaluated on the few frequen
 propagated to the nearest of ``N_PLANES`` planes, which the window's margin leaves room for. The transmittance T is one
 array for all. Each plane is propagated to the hologram by the angular spectrum method, once.
 
-What is left out is the ringing of a Gaussian narrower than a pixel or two, whose spectrum the pitch cuts off: a few
-thousandths of its peak, which spread over the whole grid.
+What is left out is the ringing of Gaussians about as narrow as a pixel, whose spectrum the pitch cuts off, beyond their
+windows: less than a fiftieth for a standard deviation of 0.55 pixels, the least that the low-pass leaves, and less than
+a thousandth from 1 pixel on.
 
 The silhouette method does the same plane by plane from the back, with a transmittance for each plane.
 """
