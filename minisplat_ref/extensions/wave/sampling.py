@@ -119,8 +119,9 @@ def check_sampling(flats: Flats, grid: Grid, wavelengths: Floats, distance: floa
     least = finest_pitch(longest, distance, width)
     if pitch < least:
         raise InputError(
-            f"a pitch of {_um(pitch)} um lets light of {longest * 1e9:.0f} nm leave so steeply that it wraps around the"
-            f" {_um(width)} um of the hologram on {distance * 1e3:.3g} mm: a pitch of {_um_up(least)} um fits"
+            f"a pitch of {_um(pitch)} um lets light of {longest * 1e9:.0f} nm leave so steeply that within"
+            f" {distance * 1e3:.3g} mm it crosses the {_um(width)} um of the hologram and wraps around: a pitch of"
+            f" {_um_up(least)} um fits"
         )
     narrowest = math.sqrt(max(float(np.linalg.eigvalsh(flats.lateral_covariances)[:, 0].min()), 0))
     if narrowest < PIXELS_MIN * pitch:
