@@ -148,6 +148,7 @@ ORDER = (
                 (),
                 "materials blended and shaded once per pixel, in an environment that is learned",
             ),
+            Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),
     ),
     Part(

@@ -488,6 +488,8 @@ CONSTANTS = [
     ("surfels.losses", "NEAR", 0.2, "2DGS, released code"),
     ("surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
+    ("wave.hologram", "PITCH", 8.0, f"{OURS}: um, of displays of phases that can be bought"),
+    ("wave.hologram", "WAVELENGTHS", (638.0, 520.0, 450.0), f"{OURS}: nm, of laser diodes"),
     ("vr.foveation", "ACUITY_OFFSET", 0.02083333333, "Guenter et al. 2012"),
     ("vr.foveation", "ACUITY_SLOPE", 0.0275, "Guenter et al. 2012"),
     ("vr.queues", "SIZES", (64, 8, 4), "StopThePop, released code"),
