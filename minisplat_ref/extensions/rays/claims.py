@@ -188,11 +188,12 @@ def run_speed(args: argparse.Namespace) -> str:
     """Time a ray and a rasterised pixel."""
     found = speed(args.gaussians, args.repeats)
     table = markdown_table(["measure", "value"], [[name, f"{value:.3g}"] for name, value in found.items()])
-    both = {name: found[f"{name} forward us"] + found[f"{name} backward us"] for name in ("ray", "plain pixel", "pixel")}
-    tuned, plain = both["ray"] / both["pixel"], both["ray"] / both["plain pixel"]
+    ray, tuned, plain = (
+        found[f"{name} forward us"] + found[f"{name} backward us"] for name in ("ray", "pixel", "plain pixel")
+    )
     text = (
-        f"Forward and backward, a ray takes {tuned:.1f} times as long as a pixel of the tuned kernels,"
-        f" {plain:.1f} times a plain one."
+        f"Forward and backward, a ray takes {ray / tuned:.1f} times as long as a pixel of the tuned kernels,"
+        f" {ray / plain:.1f} times a plain one."
     )
     return f"{table}\n\n{text}"
 
