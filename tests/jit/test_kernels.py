@@ -291,17 +291,17 @@ from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.training.loop import train
 arrays = {}
-for dtype in (np.float32, np.float64):
-    for stage, results in every_stage(dtype, (101, 67), 150).items():
-        arrays |= {f"{stage} {np.dtype(dtype)} {i}": array for i, array in enumerate(results)}
+for stage, results in every_stage(np.dtype(sys.argv[3]), (101, 67), 150).items():
+    arrays |= {f"{stage} {i}": array for i, array in enumerate(results)}
 state = train(load_scene(sys.argv[2]), get_recipe("3dgs-accel")._replace(iterations=50), seed=0)
 arrays |= {f"trained {name}": array for name, array in state.gaussians._asdict().items()}
 np.savez(sys.argv[1], **arrays)
 """
 
 
-def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
-    """Every stage, in both precisions, and a training; and the second process must not compile anything again.
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])  # compiling is the time
+def test_compiled_and_cached_kernels_give_the_same_bytes(dtype, tmp_path):
+    """Every stage, and a training; and the second process must not compile anything again.
 
     The body of a parallel loop is compiled two or three times, each time within other code, and a process that loads it
     may run another copy than the one that compiled it. The copies round alike if the same products are contracted in
@@ -315,14 +315,14 @@ def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(kernels), "PYTHONPATH": folders}
     results, cached = [], []
     for name in ("compiled.npz", "cached.npz"):
-        command = [sys.executable, "-c", FROM_CACHE, str(tmp_path / name), str(scene)]
+        command = [sys.executable, "-c", FROM_CACHE, str(tmp_path / name), str(scene), dtype]
         subprocess.run(command, env=environment, check=True)
         with np.load(tmp_path / name) as arrays:
             results.append({key: arrays[key].tobytes() for key in arrays.files})
         cached.append(sorted(path.name for path in kernels.rglob("*.nbc")))
-    assert len(results[0]) > 90
+    assert len(results[0]) > 45
     assert [key for key in results[0] if results[0][key] != results[1][key]] == []
-    assert len(cached[0]) > 30 and cached[0] == cached[1]
+    assert len(cached[0]) > 20 and cached[0] == cached[1]
 
 
 @pytest.mark.parametrize(

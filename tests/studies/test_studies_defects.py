@@ -59,7 +59,7 @@ def test_command(tmp_path, capsys):
 
 def test_sky_is_planted_above_the_cut():
     """Where something lower than 1.2 m is seen, the photograph stays; elsewhere its colours are those of the sky."""
-    truth = make_scene("room")
+    truth = make_scene("room", supersampling=1)
     scene = defects.under_a_sky(truth.scene, np.random.default_rng(0))
     assert 0 < len(scene.points) < len(truth.scene.points) and scene.points[:, 2].max() <= defects.CUT
     shown, heights = [], []
