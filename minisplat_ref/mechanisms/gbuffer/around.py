@@ -1,0 +1,87 @@
+"""The light that a surfel receives from the scene around it, by the direction of reflection.
+
+A camera with the pose R, t sees the surfel at ``x = R mu + t`` along ``d = x / |x|``. Its normal n, in the camera's
+frame, reflects that to ``r = d - 2 (d.n) n``, and in the world the light from there is::
+
+    max(0, 1/2 + sum_k c_k Y_k(R^T r))
+
+with the coefficients of the surfel's spherical harmonics, of which 3DGS makes the colour along d.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
+from minisplat_ref.types import Floats
+
+
+class Sight(NamedTuple):
+    """How a camera sees M surfels."""
+
+    x: Floats
+    """[M, 3] centres, camera frame."""
+    d: Floats
+    """[M, 3] unit, towards them, camera frame."""
+    normals: Floats
+    """[M, 3] unit, camera frame, towards the camera."""
+    R: Floats
+    """[3, 3] cam_from_world."""
+
+
+class AroundGradient(NamedTuple):
+    """Gradient of the loss with respect to the inputs of :func:`light_around`."""
+
+    coefficients: Floats  # [M, K, 3]
+    x: Floats  # [M, 3]
+    normals: Floats  # [M, 3]
+    R: Floats  # [3, 3]
+
+
+def sight_of(means: Floats, normals: Floats, pose: tuple[Floats, Floats]) -> Sight:
+    """Return how a camera of a pose (R, t) sees surfels at ``means`` [M, 3], world frame."""
+    R, t = pose
+    x = means @ R.T + t
+    return Sight(x, x / np.linalg.norm(x, axis=1, keepdims=True), normals, R)
+
+
+def light_around(sight: Sight, coefficients: Floats, degree: int) -> Floats:
+    """Return the light [M, 3] that surfels of ``coefficients`` [M, K, 3] receive from around, linear RGB."""
+    basis = sh_basis(_reflected(sight) @ sight.R, degree)
+    return np.maximum(0, 0.5 + np.einsum("mk,mkc->mc", basis, coefficients[:, : basis.shape[1]]))
+
+
+def light_around_vjp(sight: Sight, coefficients: Floats, degree: int, v_light: Floats) -> AroundGradient:
+    """Gradient of :func:`light_around`.
+
+    ::
+
+        v_c_k = Y_k v,   v_w = sum_k (c_k . v) dY_k/dw      w = R^T r; v is v_light where the light is positive, else 0
+        v_r   = R v_w,   v_R = sum r v_w^T
+        v_n   = -2 ((d.n) v_r + (n.v_r) d),   v_d = v_r - 2 (n.v_r) n,   v_x = (v_d - d (d.v_d)) / |x|
+    """
+    r, (x, d, n, R) = _reflected(sight), sight
+    w = r @ R
+    basis = sh_basis(w, degree)
+    active = coefficients[:, : basis.shape[1]]
+    v = np.where(0.5 + np.einsum("mk,mkc->mc", basis, active) > 0, v_light, 0)
+    v_coefficients = np.zeros_like(coefficients)
+    v_coefficients[:, : basis.shape[1]] = basis[:, :, None] * v[:, None, :]
+    v_w = np.einsum("mk,mki->mi", np.einsum("mkc,mc->mk", active, v), sh_basis_jacobian(w, degree))
+    v_r = v_w @ R.T
+    d_n, n_v = np.sum(d * n, axis=1, keepdims=True), np.sum(n * v_r, axis=1, keepdims=True)
+    return AroundGradient(
+        coefficients=v_coefficients,
+        x=towards_vjp(x, d, v_r - 2 * n_v * n),
+        normals=-2 * (d_n * v_r + n_v * d),
+        R=r.T @ v_w,
+    )
+
+
+def towards_vjp(x: Floats, d: Floats, v_d: Floats) -> Floats:
+    """Gradient of ``d = x / |x|``: ``v_x = (v_d - d (d.v_d)) / |x|``."""
+    return (v_d - d * np.sum(d * v_d, axis=1, keepdims=True)) / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+def _reflected(sight: Sight) -> Floats:
+    return sight.d - 2 * np.sum(sight.d * sight.normals, axis=1, keepdims=True) * sight.normals

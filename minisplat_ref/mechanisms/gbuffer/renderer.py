@@ -1,0 +1,308 @@
+"""How reflective surfels are drawn: shaded one by one and then blended, or blended and then shaded pixel by pixel.
+
+The shared parameter ``shading_stage`` says which (:mod:`.population`). Per surfel, each has a colour, which is blended
+as in 2D Gaussian Splatting. Per pixel, what is blended are materials, normals and the light from around::
+
+    X = sum_i w_i x_i / A,   n = sum_i w_i n_i / |sum_i w_i n_i|,   image = A tone(shade(X, n)) + (1 - A) background
+
+with the accumulated opacity A. With occlusion, ``1 - V`` is the opacity of the surfels along the reflected ray, from
+the expected depth of the pixel on (:mod:`minisplat_ref.mechanisms.gbuffer.visibility`).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.gbuffer.around import (
+    Sight,
+    light_around,
+    light_around_vjp,
+    sight_of,
+    towards_vjp,
+)
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.population import (
+    PER_PIXEL,
+    STAGE,
+    WITH_OCCLUSION,
+    ReflectiveSurfels,
+    sigmoid,
+)
+from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter, prefilter_vjp
+from minisplat_ref.mechanisms.gbuffer.shading import Around, ShadingTape, Surface, shade, shade_vjp
+from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp
+from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays
+from minisplat_ref.mechanisms.surfels import renderer as discs
+from minisplat_ref.mechanisms.surfels.projection import SurfelGradient, centers_moved, project_vjp
+from minisplat_ref.reference.pinhole import pose, with_principal_point
+from minisplat_ref.rendering import Renderer, RenderGradient, Request, choose_degree, parameters_vjp
+from minisplat_ref.training.sky import unit_rays
+from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
+
+MAPS = {"albedo": 3, "metallic": 1, "roughness": 1}
+"""The material's channels, in the order in which surfels carry them."""
+RAY_START = 0.02  # of the pixel's depth: where a reflected ray begins, so that it misses its own surface
+GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
+
+
+class _Pixels(NamedTuple):
+    """The pixels that show a surfel, and what was blended there."""
+
+    rows: Ints  # [P] y W + x
+    alpha: Floats  # [P] A
+    blended: Floats  # [P, 3 + 3 + 5] sums: light from around, normals, materials
+    lengths: Floats  # [P, 1] of the summed normals
+    to_camera: Floats  # [P, 3] camera frame
+
+
+class ReflectiveTape(NamedTuple):
+    """What :func:`render` keeps for :func:`render_vjp`."""
+
+    model: Model
+    seen: discs.Seen
+    request: Request
+    blend: discs.BlendTape
+    rows: Ints  # [M] visible surfels
+    sight: Sight
+    degree: int
+    shading: ShadingTape
+    linear: Floats  # [M or P, 3] colours before the tone curve
+    environment: Floats  # [H, 2 H, 3]
+    pixels: _Pixels | None  # of shading per pixel
+    slices: dict[str, slice]  # of what is blended
+
+
+def channels(wants: frozenset[str]) -> dict[str, slice]:
+    """Return the image's channels by name: those of surfels, and maps of the material, as sums over the hits."""
+    slices = discs.channels(wants - MAPS.keys())
+    first = max(part.stop for part in slices.values())
+    for name, size in MAPS.items():
+        if name in wants:
+            slices[name] = slice(first, first + size)
+            first += size
+    return slices
+
+
+def materials(g: ReflectiveSurfels) -> Floats:
+    """Return albedo, metallic share and roughness of all surfels, [N, 5]."""
+    return np.column_stack([sigmoid(g.albedo_logits), sigmoid(g.metallic_logits), sigmoid(g.roughness_logits)])
+
+
+def render(
+    model: Model, view: View, request: Request, visibility: Floats | None = None, *, mirrors: bool
+) -> tuple[RenderOutput, ReflectiveTape]:
+    """Render a view of reflective surfels; see :func:`minisplat_ref.mechanisms.surfels.renderer.render`.
+
+    Parameters
+    ----------
+    model : Model
+        :class:`.population.ReflectiveSurfels`, and the shared parameters of :func:`.population.first_light`.
+    view, request
+        As there; the maps of ``MAPS`` can be wanted, too.
+    visibility : ndarray of shape (H, W), optional
+        How much of the environment each pixel's reflected ray sees; traced by default.
+    mirrors : bool
+        Whether surfels reflect light besides scattering it.
+
+    Raises
+    ------
+    InputError
+        The model has no environment.
+    """
+    if ENVIRONMENT not in model.shared:
+        raise InputError("a file of reflective surfels has no place for their light: render the run's folder instead")
+    g, dtype = model.gaussians, model.gaussians.means.dtype
+    stage = round(float(model.shared[STAGE][0]))
+    maps = request.wants & MAPS.keys()
+    own = request._replace(wants=request.wants - maps | (GUIDES if stage >= PER_PIXEL else frozenset()))
+    seen = discs.look(model, view, own)
+    rows = np.flatnonzero(seen.surfels.radii[:, 0] > 0)
+    camera = with_principal_point(view.camera, request.conventions)
+    sight = sight_of(g.means[rows], seen.surfels.normals[rows].astype(dtype), pose(camera, dtype))
+    degree = int(np.max(choose_degree(g.sh_rest, request.sh_degree), initial=0))
+    environment = np.exp(model.shared[ENVIRONMENT].astype(dtype))
+    light, carried, colors = prefilter(environment), materials(g), np.zeros_like(g.means)
+    slices = discs.channels(own.wants)
+    if stage < PER_PIXEL:
+        surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
+        linear, shading = shade(surface, light, mirrors=mirrors)
+        colors[rows] = tone(linear)
+        output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
+        image, pixels = output.image, None
+    else:
+        colors[rows] = light_around(sight, coefficients(g, rows), degree)
+        output, tape = discs.blend(seen, colors, carried, own._replace(background=None))
+        pixels = _pixels(output, slices, camera, request)
+        n_world = pixels.blended[:, 3:6] / pixels.lengths @ sight.R
+        X = pixels.blended / pixels.alpha[:, None]
+        surface = _surface(X[:, 6:], n_world, pixels.to_camera @ sight.R)
+        around = None
+        if stage >= WITH_OCCLUSION:
+            if visibility is None:
+                sees = _visibility(surface, output, pixels, seen, request)
+            else:
+                sees = visibility.ravel()[pixels.rows]
+            around = Around(sees, np.ascontiguousarray(X[:, :3]))
+        linear, shading = shade(surface, light, around, mirrors)
+        background = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
+        image = output.image.copy()
+        image[:, :, :3] = background
+        shown = pixels.alpha[:, None] * tone(linear) + (1 - pixels.alpha[:, None]) * background
+        image.reshape(-1, image.shape[2])[pixels.rows, :3] = shown
+    wanted = [image[:, :, slices[name]] for name in discs.channels(request.wants - maps)]
+    first = max(part.stop for part in slices.values())
+    for (name, size), at in zip(MAPS.items(), (0, 3, 4), strict=True):
+        if name in maps:
+            wanted.append(image[:, :, first + at : first + at + size])
+    output = output._replace(image=np.ascontiguousarray(np.concatenate(wanted, axis=2)))
+    return output, ReflectiveTape(
+        model, seen, request, tape, rows, sight, degree, shading, linear, environment, pixels, slices
+    )
+
+
+def render_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render`, by the chain rule; how much of the environment is visible is held constant.
+
+    Per pixel::
+
+        v_X = v_shade / A,   v_N = (v_n - n (n.v_n)) / |N|
+        v_A = v_image . (tone - background) - sum v_X . X,   v_background = sum (1 - A) v_image
+    """
+    g, dtype, request = tape.model.gaussians, tape.linear.dtype, tape.request
+    v_alpha = np.zeros(v_image.shape[:2], v_image.dtype) if v_alpha is None else v_alpha.copy()
+    v_sums = _v_blended(tape, v_image)
+    R = tape.sight.R
+    v_R, v_x, v_normals = np.zeros((3, 3)), np.zeros_like(tape.sight.x), np.zeros_like(tape.sight.normals)
+    if tape.pixels is not None:
+        p = tape.pixels
+        v_rgb = v_image.reshape(-1, v_image.shape[2])[:, :3]
+        behind = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
+        A, v_seen = p.alpha[:, None], v_rgb[p.rows]
+        v_background = v_rgb.sum(axis=0) - np.sum(A * v_seen, axis=0)
+        v = shade_vjp(tape.shading, tone_vjp(tape.linear, A * v_seen))
+        v_X = np.zeros_like(p.blended)
+        v_X[:, 6:9], v_X[:, 9], v_X[:, 10] = v.surface.albedo, v.surface.metallic, v.surface.roughness
+        if v.around is not None:
+            v_X[:, :3] = v.around
+        v_alpha.ravel()[p.rows] += np.sum(v_seen * (tone(tape.linear) - behind), axis=1)
+        v_alpha.ravel()[p.rows] -= np.sum(v_X * p.blended, axis=1) / p.alpha**2
+        n = p.blended[:, 3:6] / p.lengths
+        v_n = v.surface.normals @ R.T
+        v_X = v_X / A
+        v_X[:, 3:6] = (v_n - n * np.sum(n * v_n, axis=1, keepdims=True)) / p.lengths
+        v_R += n.T @ v.surface.normals + p.to_camera.T @ v.surface.to_camera
+        flat, first = v_sums.reshape(-1, v_sums.shape[2]), max(part.stop for part in tape.slices.values())
+        flat[:, :3] = 0
+        flat[p.rows, :3] = v_X[:, :3]
+        flat[p.rows, tape.slices["normal"]] += v_X[:, 3:6]
+        flat[p.rows, first:] += v_X[:, 6:]
+    v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
+    v_carried = np.zeros((len(g.means), 5), dtype)
+    v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
+    v_coefficients = np.zeros((len(tape.rows), 1 + g.sh_rest.shape[1], 3), dtype)
+    if tape.pixels is not None:
+        v_light = v_blend.colors[tape.rows]
+        v_around = light_around_vjp(tape.sight, coefficients(g, tape.rows), tape.degree, v_light)
+        v_coefficients, v_x, v_normals = v_around.coefficients, v_around.x, v_around.normals
+        v_R = v_R + v_around.R
+    else:
+        v_background = v_blend.background
+        v = shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
+        v_carried[tape.rows, :3] += v.surface.albedo
+        v_carried[tape.rows, 3] += v.surface.metallic
+        v_carried[tape.rows, 4] += v.surface.roughness
+        v_normals = v.surface.normals @ R.T
+        v_x = towards_vjp(tape.sight.x, tape.sight.d, -v.surface.to_camera @ R.T)
+        v_R = tape.sight.normals.T @ v.surface.normals - tape.sight.d.T @ v.surface.to_camera
+    return _of_parameters(tape, v_blend.surfels, (v_x, v_normals, v_R), (v_coefficients, v_carried))._replace(
+        background=v_background.astype(dtype),
+        shared={
+            ENVIRONMENT: (tape.environment * prefilter_vjp(tape.environment, v.light)).astype(dtype),
+            STAGE: np.zeros_like(tape.model.shared[STAGE]),
+        },
+    )
+
+
+def _of_parameters(
+    tape: ReflectiveTape, v: SurfelGradient, of_sight: tuple[Floats, Floats, Floats], of_fields: tuple[Floats, Floats]
+) -> RenderGradient:
+    """Return the gradient with respect to population and pose, without those of background and shared parameters."""
+    g, rows, (v_x, v_normals, v_R) = tape.model.gaussians, tape.rows, of_sight
+    v_coefficients, v_carried = of_fields
+    all_normals = v.normals.copy()
+    all_normals[rows] += v_normals
+    v = v._replace(normals=all_normals)
+    v_primitives = project_vjp(tape.seen.primitives, tape.seen.camera, tape.request.conventions, tape.seen.surfels, v)
+    v_means, v_sh_dc, v_sh_rest = np.zeros_like(g.means), np.zeros_like(g.sh_dc), np.zeros_like(g.sh_rest)
+    v_means[rows], v_sh_dc[rows], v_sh_rest[rows] = v_x @ tape.sight.R, v_coefficients[:, 0], v_coefficients[:, 1:]
+    v_R = v_R + v_x.T @ g.means[rows]
+    zero = np.zeros((3, 3), g.means.dtype)
+    of_six = parameters_vjp(
+        g, tape.seen.primitives, v_primitives, SHGradient(v_means, v_sh_dc, v_sh_rest, zero, zero[0])
+    )
+    shares = materials(g)
+    v_logits = shares * (1 - shares) * v_carried
+    return RenderGradient(
+        gaussians=of_six._replace(
+            albedo_logits=v_logits[:, :3], metallic_logits=v_logits[:, 3], roughness_logits=v_logits[:, 4]
+        ),
+        background=zero[0],
+        cam_from_world_R=(v_primitives.cam_from_world_R + v_R).astype(g.means.dtype),
+        cam_from_world_t=(v_primitives.cam_from_world_t + v_x.sum(axis=0)).astype(g.means.dtype),
+        means2d=centers_moved(v, tape.seen.surfels).astype(g.means.dtype),
+    )
+
+
+def _surface(carried: Floats, normals: Floats, to_camera: Floats) -> Surface:
+    return Surface(np.ascontiguousarray(carried[:, :3]), carried[:, 3], carried[:, 4], normals, to_camera)
+
+
+def coefficients(g: ReflectiveSurfels, rows: Ints) -> Floats:
+    """Return the coefficients [M, K, 3] of the light from around."""
+    return np.concatenate([g.sh_dc[rows, None], g.sh_rest[rows]], axis=1)
+
+
+def _pixels(output: RenderOutput, slices: dict[str, slice], camera: Camera, request: Request) -> _Pixels:
+    """Return the pixels that show a surfel whose normals do not cancel."""
+    flat = output.image.reshape(-1, output.image.shape[2])
+    normals, alpha = flat[:, slices["normal"]], output.alpha.ravel()
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    rows = np.flatnonzero((alpha > request.conventions.alpha_min / 2) & (lengths[:, 0] > 0))
+    first = max(part.stop for part in slices.values())
+    blended = np.column_stack([flat[rows, :3], normals[rows], flat[rows, first:]])
+    return _Pixels(rows, alpha[rows], blended, lengths[rows], -unit_rays(camera, rows, flat.dtype))
+
+
+def _visibility(surface: Surface, output: RenderOutput, pixels: _Pixels, seen: discs.Seen, request: Request) -> Floats:
+    """Return how much of the environment the reflected ray of each pixel sees."""
+    depth = output.image.reshape(-1, output.image.shape[2])[pixels.rows, 3] / pixels.alpha
+    camera = with_principal_point(seen.camera, request.conventions)
+    R, t = pose(camera, np.dtype(np.float64))
+    ray = unit_rays(camera, pixels.rows, np.dtype(np.float64))
+    points = (ray / ray[:, 2:] * depth[:, None] - t) @ R
+    n, v = surface.normals.astype(np.float64), surface.to_camera.astype(np.float64)
+    r = 2 * np.sum(n * v, axis=1, keepdims=True) * n - v
+    near = RAY_START * depth
+    rays = Rays(points, r, near, np.full_like(near, np.inf))
+    return transmittances(seen.primitives, rays, request.conventions, request.backend).astype(output.image.dtype)
+
+
+def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
+    """Return the derivative with respect to what was blended from that of the wanted channels."""
+    blended, maps = tape.slices, tape.request.wants & MAPS.keys()
+    first = max(part.stop for part in blended.values())
+    has_carried = tape.pixels is not None or bool(maps)
+    v = np.zeros((*v_image.shape[:2], first + (5 if has_carried else 0)), v_image.dtype)
+    for name, part in channels(tape.request.wants).items():
+        if name in MAPS:
+            at = first + {"albedo": 0, "metallic": 3, "roughness": 4}[name]
+            v[:, :, at : at + MAPS[name]] = v_image[:, :, part]
+        else:
+            v[:, :, blended[name]] = v_image[:, :, part]
+    return v
+
+
+REFLECTIVE = Renderer("reflective surfels", partial(render, mirrors=True), render_vjp, channels)
