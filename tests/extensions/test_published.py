@@ -467,10 +467,34 @@ TABLES = {
     },
 }
 
+TABLES["discretized-sdf"] = {
+    name.replace("reset_opacity", "reset_distances"): row for name, row in TABLES["reflective"].items()
+} | {
+    **rows(
+        "Discretized SDF, its losses",
+        normal_consistency=(0.2, 7_001),
+        distortion=(100.0, 3_001),
+        median=(100.0, 1_001),
+        silhouette=(1e-3, 1),
+        projection__reach=0.1,
+    ),
+    **rows(
+        f"{OURS}: weight of the projection, the foreground, rates, and opacities for others",
+        projection=(1.0, 1),
+        extend__foreground=0.5,
+        rate__distances=1.25e-3,
+        rate__log_width=1e-3,
+        rate__opacity_logits=0.0,
+        refresh_opacities=[steps(1, 30_000)],
+    ),
+}
+
 CONSTANTS = [
     ("antialiasing.method", "EPS2D", 0.1, "Mip-Splatting, released code"),
     ("analytic.reference", "LINEAR", 1.6, "Analytic-Splatting, its logistic curve"),
     ("analytic.reference", "CUBIC", 0.07, "Analytic-Splatting, its logistic curve"),
+    ("discretized_sdf.reference", "HALF", 1.762747, "Discretized SDF, the gamma of the median loss"),
+    ("discretized_sdf.population", "WIDTH", 0.05, f"{OURS}: half of the projection's reach"),
     ("gaustudio.backgrounds", "N_BALL", 10_000, "GauStudio, released code"),
     ("gaustudio.densities", "THRESHOLD", 2e-4, "3DGS, section 5.2"),
     ("gaustudio.densities", "SIZE_FRACTION", 0.01, "3DGS, released code of 2023"),

@@ -25,8 +25,9 @@ does not change; faint surfels are pruned by their opacity, and a reset of opaci
 
 This deviates from the paper as follows. The foreground is the half of the points that is nearest to their median, and
 its radius, the weight of the projection, the first gamma and all rates are ours. The inverse of D is interpolated.
-Dates of normals and distortion are those of 2D Gaussian Splatting. A mask of the scene is taken for the object's: where it
-hides something else, train with ``--set silhouette=0``. With another recipe, density control sees the first opacities.
+Dates of normals and distortion are those of 2D Gaussian Splatting. A mask of the scene is taken for the object's: where
+it hides something else, train with ``--set silhouette=0``. With another recipe, density control sees the first
+opacities.
 """
 
 from minisplat_ref.extensions.discretized_sdf.method import DISTANCED, RECIPE
