@@ -243,7 +243,7 @@ def test_the_sphere_is_measured_as_it_says(small_study):
     exact = g._replace(distances=np.linalg.norm(g.means, axis=1) - 1)
     found = study.measure(exact, study.opacities(exact, WIDTH), truths)
     assert found["radius_error"] < 1e-9 and found["consistency"] < 1e-9
-    assert_allclose(found["slope"], 1, atol=0.05)  # normals of neighbours differ
+    assert_allclose(found["slope"], 1, atol=0.02)  # normals of neighbours differ
     farther = exact._replace(
         means=1.2 * exact.means / np.linalg.norm(exact.means, axis=1)[:, None], distances=0 * g.distances
     )
@@ -262,7 +262,7 @@ def test_the_albedo_is_compared_up_to_a_factor(small_study):
         truth = study.trace(view.camera)
         light = study._light(0 if model.shared[ENVIRONMENT] is shared[ENVIRONMENT] else 1)
         image = np.zeros((18, 24, 6))
-        image[..., :3] = study.photograph(truth, light)
+        image[..., :3] = study.photograph(truth, light) + 1e-7
         image[truth.is_sphere, 3:] = study.albedo_at(truth.normals) ** (1 if factor else 2) * 0.5
         if "albedo" not in request.wants:
             image = image[..., :3]

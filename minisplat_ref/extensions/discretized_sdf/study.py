@@ -171,7 +171,8 @@ def eikonal(g: SDFSurfels, n_neighbours: int = 6) -> float:
 
     normals = g.means / np.linalg.norm(g.means, axis=1, keepdims=True)
     _, near = cKDTree(normals).query(normals, n_neighbours + 1)
-    rise = np.sum((g.means[near[:, 1:]] - g.means[:, None]) * normals[:, None], axis=2)
+    between = (normals[near[:, 1:]] + normals[:, None]) / 2  # by one normal alone, the curvature would count as rise
+    rise = np.sum((g.means[near[:, 1:]] - g.means[:, None]) * between, axis=2)
     return float(np.sum((g.distances[near[:, 1:]] - g.distances[:, None]) * rise) / np.sum(rise * rise))
 
 
