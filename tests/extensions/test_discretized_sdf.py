@@ -56,6 +56,10 @@ def test_opacity_is_the_published_function_of_the_distance():
     o, transparency = 1 / np.cosh(1.25 * s) ** 2, np.tanh(1.25 * s) ** 2
     v_s, _ = opacity_logits_vjp(s, log_of(0.4), o * transparency)
     assert_allclose(v_s, -2.5 * np.tanh(1.25 * s) * o, rtol=1e-9, atol=1e-25)
+    _, v_w = opacity_logits_vjp(s, log_of(0.4), np.ones(6))
+    h = 1e-5
+    difference = opacity_logits(s, log_of(0.4) + h) - opacity_logits(s, log_of(0.4) - h)
+    assert_allclose(v_w, [np.sum(np.delete(difference, 3)) / (2 * h) + 2], rtol=1e-6)  # s = 0 counts as x -> 0: 2
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
