@@ -144,9 +144,9 @@ ORDER = (
                 "discs with depths and normals; from depth maps to a mesh",
             ),
             Step(
-                ("mechanisms/gbuffer/", "extensions/reflective/"),
+                ("mechanisms/gbuffer/", "extensions/reflective/", "extensions/discretized_sdf/"),
                 (),
-                "materials blended and shaded once per pixel, in an environment that is learned",
+                "materials blended, then shaded per pixel in an environment that is learned; opacity from distances",
             ),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),

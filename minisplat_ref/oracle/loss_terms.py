@@ -5,7 +5,8 @@ of the tiny scene, photographed at random and seen through a mask, with sparse p
 added to the rendered channels, because neighbours that show one Gaussian have one depth, at which an absolute
 difference has no derivative. Its
 inputs are the channels of the image, alpha, the fields of the population and the shared parameters: those that the
-cotangents name, and those with which the value changes, so that a derivative that is left out is wrong, too.
+cotangents name, and those with which the value changes, so that a derivative that is left out is wrong, too. What a
+term holds constant (``Rendered.constant``) does not move.
 
 A term does not tell its thresholds, such as the kink of an absolute value. So its differences have to settle
 (:func:`minisplat_ref.oracle.differences.settled_derivative`).
@@ -104,7 +105,8 @@ def loss_stage(
         moved_output = output._replace(image=image, alpha=given[ALPHA])
         population = model.gaussians._replace(**{name: given[name] for name in fields})
         moved_model = model._replace(gaussians=population, shared={name: given[name] for name in model.shared})
-        return term.function(Rendered(moved_output, channels, view, scene, moved_model, step, request))
+        at_rest = Rendered(output, channels, view, scene, model, step, request)
+        return term.function(at_rest._replace(output=moved_output, model=moved_model, held=at_rest))
 
     step = _acting_step(term, lambda step: evaluate({}, step))
     if step is None:

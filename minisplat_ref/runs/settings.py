@@ -40,7 +40,7 @@ from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
-SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters
+SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters of any recipe
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
 
 
@@ -156,7 +156,7 @@ def place_model(model: Model, owner: Extension, frame: Frame) -> Model:
         return model
     return Model(
         place_population(model.gaussians, owner.representation.units, frame),
-        place_fields(model.shared, SHARED_UNITS, frame),
+        place_fields(model.shared, {**SHARED_UNITS, **owner.representation.units}, frame),
     )
 
 
@@ -166,7 +166,7 @@ def return_model(model: Model, owner: Extension, frame: Frame) -> Model:
         return model
     return Model(
         return_population(model.gaussians, owner.representation.units, frame),
-        return_fields(model.shared, SHARED_UNITS, frame),
+        return_fields(model.shared, {**SHARED_UNITS, **owner.representation.units}, frame),
     )
 
 

@@ -8,7 +8,7 @@ terms a method has, and in which iterations.
 
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,13 @@ class Rendered(NamedTuple):
     """Iteration, from 1."""
     request: Request
     """How it was rendered: backend, conventions, background."""
+    held: Any = None
+    """The same view at the values that derivatives hold constant, while a check moves the others; None: itself."""
+
+    @property
+    def constant(self) -> "Rendered":
+        """Return where a term takes what its derivatives hold constant, such as a target made of the rendering."""
+        return self if self.held is None else self.held
 
     def channel(self, name: str) -> Floats:
         """Return channel ``name`` of the image, [H, W, d], C-contiguous."""

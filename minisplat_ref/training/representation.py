@@ -42,7 +42,7 @@ class Representation(NamedTuple):
     rates: Rates = Rates({}, frozenset())
     """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
     units: Units = WORLD_UNITS
-    """What of the population is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
+    """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
 
 
 GAUSSIANS = Representation("gaussians")

@@ -467,10 +467,34 @@ TABLES = {
     },
 }
 
+TABLES["discretized-sdf"] = {
+    name.replace("reset_opacity", "reset_distances"): row for name, row in TABLES["reflective"].items()
+} | {
+    **rows(
+        "Discretized SDF, its losses",
+        normal_consistency=(0.2, 7_001),
+        distortion=(100.0, 3_001),
+        median=(100.0, 1_001),
+        silhouette=(1e-3, 1),
+        projection__reach=0.1,
+    ),
+    **rows(
+        f"{OURS}: weight of the projection, the foreground, rates, and opacities for others",
+        projection=(1.0, 1),
+        extend__foreground=0.5,
+        rate__distances=1.25e-3,
+        rate__log_width=1e-3,
+        rate__opacity_logits=0.0,
+        refresh_opacities=[steps(1, 30_000)],
+    ),
+}
+
 CONSTANTS = [
     ("antialiasing.method", "EPS2D", 0.1, "Mip-Splatting, released code"),
     ("analytic.reference", "LINEAR", 1.6, "Analytic-Splatting, its logistic curve"),
     ("analytic.reference", "CUBIC", 0.07, "Analytic-Splatting, its logistic curve"),
+    ("discretized_sdf.reference", "HALF", 1.762747, "Discretized SDF, the gamma of the median loss"),
+    ("discretized_sdf.population", "WIDTH", 0.05, f"{OURS}: half of the projection's reach"),
     ("gaustudio.backgrounds", "N_BALL", 10_000, "GauStudio, released code"),
     ("gaustudio.densities", "THRESHOLD", 2e-4, "3DGS, section 5.2"),
     ("gaustudio.densities", "SIZE_FRACTION", 0.01, "3DGS, released code of 2023"),
@@ -484,9 +508,9 @@ CONSTANTS = [
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
-    ("reflective.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
-    ("surfels.losses", "NEAR", 0.2, "2DGS, released code"),
-    ("surfels.losses", "FAR", 100.0, "2DGS, released code"),
+    ("mechanisms.gbuffer.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
+    ("mechanisms.surfels.losses", "NEAR", 0.2, "2DGS, released code"),
+    ("mechanisms.surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
     ("wave.hologram", "PITCH", 8.0, f"{OURS}: um, of displays of phases that can be bought"),
     ("wave.hologram", "WAVELENGTHS", (638.0, 520.0, 450.0), f"{OURS}: nm, of laser diodes"),
@@ -550,7 +574,8 @@ def test_every_recipe_with_a_paper_has_a_table():
 
 @pytest.mark.parametrize(("module", "name", "value", "source"), CONSTANTS)
 def test_a_constant_is_the_published_one(module, name, value, source):
-    assert getattr(import_module(f"minisplat_ref.extensions.{module}"), name) == pytest.approx(value, rel=1e-6), source
+    place = "" if module.startswith("mechanisms") else "extensions."
+    assert getattr(import_module(f"minisplat_ref.{place}{module}"), name) == pytest.approx(value, rel=1e-6), source
 
 
 @pytest.mark.parametrize("event", [During, SmallerViews])

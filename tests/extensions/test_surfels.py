@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.surfels.losses import distortion, median_normal_consistency, normal_consistency
 from minisplat_ref.extensions.surfels.study import ARMS, outcome
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.surfels.discs import as_surfels
+from minisplat_ref.mechanisms.surfels.losses import distortion, median_normal_consistency, normal_consistency
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.losses import Rendered

@@ -15,7 +15,7 @@ receives from around instead, its spherical harmonics in the direction r. Traini
     20,000   and with occlusion
 
 Every 1,000 iterations of the first, surfels that mirror grow by half, and others are disturbed, so that the normals of
-mirrors spread (:func:`.method.spread_normals`). The loss on normals is that of 2D Gaussian Splatting.
+mirrors spread (:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on normals is that of 2D Gaussian Splatting.
 
     minisplat-ref train SCENE --recipe reflective --out runs/reflective
     minisplat-ref render runs/reflective --map normal

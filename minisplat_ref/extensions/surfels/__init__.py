@@ -8,7 +8,7 @@ one point (u, v), in standard deviations from its centre, by equations (5) to (1
 The second form is a low-pass around the centre c, without which a disc would vanish from its edge. z is the depth of
 the hit, and the disc's normal is that of the pixel. :mod:`minisplat_ref.mechanisms.surfels` has both statements of it,
 the kernels, and gsplat's call ``rasterization_2dgs``. The recipe is 3DGS's with two losses, equations (13) and (14), at
-the published dates (:mod:`minisplat_ref.extensions.surfels.losses`):
+the published dates (:mod:`minisplat_ref.mechanisms.surfels.losses`):
 
     normal_consistency          0.05, from iteration 7,000: each surfel faces as the surface through the depths does
     median_normal_consistency   0: the same with median depths, for bounded scenes

@@ -1,7 +1,7 @@
 """The recipe of 2D Gaussian Splatting: surfels, their density control, and the paper's two losses."""
 
-from minisplat_ref.extensions.surfels.losses import LOSSES
 from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS
+from minisplat_ref.mechanisms.surfels.losses import LOSSES
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 
 RECIPE = GS_ACCEL._replace(name="surfels", losses=(*GS_ACCEL.losses, *LOSSES), events=DISC_EVENTS)

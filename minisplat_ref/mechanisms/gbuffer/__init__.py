@@ -8,6 +8,10 @@
 ``lighting``     the environment that a model has, and another from a file
 ``maps``         materials and normals as pictures
 ``visibility``   how much of the surfels' own opacity lies in the way of a reflected ray
+``population``   surfels with a material, and what they have in common
+``around``       the light that a surfel receives from the scene around it
+``renderer``     shading surfel by surfel, or pixel by pixel
+``training``     the stages of Ref-Gaussian's training
 
 Each function that training differentiates stands beside its gradient.
 """

@@ -1,13 +1,30 @@
-"""On which side of its steps a shaded point is, for checks of the gradient: what is read linearly has kinks."""
+"""Stages of the gradient check for shaded surfels, and on which side of its steps a shaded point is."""
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
+from minisplat_ref.backends import Backend
+from minisplat_ref.mechanisms.gbuffer.around import light_around
 from minisplat_ref.mechanisms.gbuffer.brdf import SIZE
 from minisplat_ref.mechanisms.gbuffer.environment import locate
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.population import STAGE
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS
+from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficients
 from minisplat_ref.mechanisms.gbuffer.shading import ShadingTape
 from minisplat_ref.mechanisms.gbuffer.tone import KNEE
-from minisplat_ref.types import Floats
+from minisplat_ref.mechanisms.surfels import stages as of_surfels
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
+
+ROWS = 4  # of the environment: fewer kinks, and fewer derivatives, than training has
 
 
 def sides_of(tape: ShadingTape, linear: Floats) -> list[np.ndarray]:
@@ -26,3 +43,52 @@ def sides_of(tape: ShadingTape, linear: Floats) -> list[np.ndarray]:
     roughness = tape.surface.roughness
     cells = [np.floor(x * (SIZE - 1)) for x in (tape.cosines, roughness)]
     return [*sides, *rows, np.searchsorted(KNOTS, roughness), *cells, tape.cosines > 0, linear > KNEE]
+
+
+def shading_stage(
+    backend: Backend,
+    setting: Setting,
+    rng: np.random.Generator,
+    representation: Representation,
+    stage: int,
+    *,
+    render: Callable[..., tuple[RenderOutput, Any]],
+    shaded: Callable[[Any], ReflectiveTape],
+) -> Stage:
+    """Return a renderer at a stage of shading; what reflected rays see is held at random values.
+
+    Parameters
+    ----------
+    backend, setting, rng
+        As for :func:`minisplat_ref.oracle.models.model_stage`.
+    representation : Representation
+        Of shaded surfels.
+    stage : int
+        Of shading.
+    render : callable
+        ``render(model, view, request, visibility)``, that of the representation.
+    shaded : callable
+        Returns of the renderer's tape that of the shading.
+    """
+    visibility = rng.uniform(size=(setting.camera.height, setting.camera.width))
+    sides: list[np.ndarray] = []
+
+    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+        output, whole = render(model, view, request, visibility)
+        tape = shaded(whole)
+        sides[:] = [*of_surfels.sides_of(tape.blend.shown), *sides_of(tape.shading, tape.linear)]
+        sides.append(light_around(tape.sight, coefficients(model.gaussians, tape.rows), tape.degree) > 0)
+        return output, whole
+
+    def shared(scene: Scene, rng: np.random.Generator) -> dict[str, Floats]:
+        first = dict(representation.shared(scene, rng))
+        return {**first, ENVIRONMENT: np.zeros((ROWS, 2 * ROWS, 3)), STAGE: np.full(1, float(stage))}
+
+    renderer = representation.renderer._replace(render=watched)
+    made = model_stage(backend, setting, representation._replace(renderer=renderer, shared=shared), rng)
+
+    def function(*args: Floats) -> Point:
+        point = made.function(*args)
+        return Point(point.outputs, (*point.sides, *sides))
+
+    return made._replace(function=function)

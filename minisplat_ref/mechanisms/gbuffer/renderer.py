@@ -15,21 +15,21 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.reflective.around import (
+from minisplat_ref.mechanisms.gbuffer.around import (
     Sight,
     light_around,
     light_around_vjp,
     sight_of,
     towards_vjp,
 )
-from minisplat_ref.extensions.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     STAGE,
     WITH_OCCLUSION,
     ReflectiveSurfels,
     sigmoid,
 )
-from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter, prefilter_vjp
 from minisplat_ref.mechanisms.gbuffer.shading import Around, ShadingTape, Surface, shade, shade_vjp
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp

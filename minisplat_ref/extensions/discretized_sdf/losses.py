@@ -1,0 +1,93 @@
+"""The losses of discretised signed distances: projection, median, and the silhouette.
+
+::
+
+    L_proj = mean |z(x_0) - D|        over surfels for which this is below ``reach``
+    L_med  = max(0, gamma_ref - gamma),   gamma_ref = ln(3 + 2 sqrt 2) / median |s|
+    L_mask = -mean (m ln A + (1 - m) ln(1 - A))
+
+z is the depth of the projected centre ``x_0 = mu - s n``, and D the rendered depth at its pixel. D and gamma_ref are
+held constant in the derivatives. Between the centres of pixels, the inverse of D is interpolated.
+"""
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.discretized_sdf.population import LOG_WIDTH
+from minisplat_ref.extensions.discretized_sdf.reference import projected, projected_vjp, reference_sharpness
+from minisplat_ref.mechanisms.depth_maps.reprojection import sample_depth
+from minisplat_ref.reference.depth import expected_depth
+from minisplat_ref.reference.pinhole import pinhole, pose, with_principal_point
+from minisplat_ref.training.losses import Cotangents, Rendered
+from minisplat_ref.types import Floats
+
+Z_MIN = 0.01  # world units: what is nearer to the camera's plane has no pixel
+ALPHA_MARGIN = 1e-6  # of A from 0 and 1, where the cross entropy is infinite
+
+
+def projection(rendered: Rendered, *, reach: float) -> tuple[float, Cotangents]:
+    """Return L_proj and its derivatives.
+
+    ::
+
+        v_x0 = R_3^T sign(z - D) / count        R_3: third row of cam_from_world_R
+
+    Parameters
+    ----------
+    rendered : Rendered
+        With the channel ``depth``.
+    reach : float
+        World units; published as 0.1.
+    """
+    g, depth = rendered.model.gaussians, rendered_depths(rendered.constant)
+    R, t = pose(rendered.view.camera, g.means.dtype)
+    z = projected(g.means, g.quats, g.distances) @ R[2] + t[2]
+    error = z - depth
+    counts = (depth > 0) & (np.abs(error) < reach)
+    n = int(counts.sum())
+    if n == 0:
+        return 0.0, Cotangents()
+    v_points = np.where(counts, np.sign(error) / n, 0).astype(g.means.dtype)[:, None] * R[2]
+    v_means, v_quats, v_distances = projected_vjp(g.quats, g.distances, v_points)
+    value = float(np.sum(np.abs(error[counts]), dtype=np.float64) / n)
+    return value, Cotangents(gaussians={"means": v_means, "quats": v_quats, "distances": v_distances})
+
+
+def rendered_depths(rendered: Rendered) -> Floats:
+    """Return the rendered depth [N] at the pixel of each projected centre; 0 where there is none."""
+    g = rendered.model.gaussians
+    camera = with_principal_point(rendered.view.camera, rendered.request.conventions)
+    R, t = pose(camera, g.means.dtype)
+    x = projected(g.means, g.quats, g.distances) @ R.T + t
+    is_ahead = x[:, 2] > Z_MIN
+    pixels = pinhole(np.where(is_ahead[:, None], x, x.dtype.type(1)), camera)
+    map_ = expected_depth(rendered.channel("depth")[..., 0], rendered.output.alpha)
+    return np.where(is_ahead, sample_depth(map_, pixels), 0).astype(g.means.dtype)
+
+
+def median(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return L_med and its derivative ``v_omega = gamma`` where gamma is too small; ``gamma = exp(-omega)``."""
+    log_width = rendered.model.shared[LOG_WIDTH]
+    gamma = float(np.exp(-log_width[0]))
+    wanted = reference_sharpness(rendered.constant.model.gaussians.distances)
+    if not gamma < wanted < np.inf:
+        return 0.0, Cotangents()
+    return wanted - gamma, Cotangents(shared={LOG_WIDTH: np.full_like(log_width, gamma)})
+
+
+def silhouette(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return L_mask, the cross entropy of alpha and the photograph's mask; 0 without a mask.
+
+    ::
+
+        v_A = (A - m) / (A (1 - A)) / pixels        where A is not within the margin
+    """
+    mask, alpha = rendered.view.mask, rendered.output.alpha
+    if mask is None:
+        return 0.0, Cotangents()
+    if mask.shape != alpha.shape:
+        raise InputError(f"the mask of {rendered.view.name} has the shape {mask.shape}, its image {alpha.shape}")
+    A = np.clip(alpha.astype(np.float64), ALPHA_MARGIN, 1 - ALPHA_MARGIN)
+    value = -float(np.mean(np.where(mask, np.log(A), np.log1p(-A))))
+    v = np.where(A == alpha, (A - mask) / (A * (1 - A)) / A.size, 0)
+    return value, Cotangents(alpha=v.astype(alpha.dtype))

@@ -1,0 +1,279 @@
+"""Discretised SDF: opacity from a distance, losses by hand, the sphere, density control, the recipe by its command."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.extensions.discretized_sdf import EXTENSION, losses, study
+from minisplat_ref.extensions.discretized_sdf.method import (
+    DISTANCED,
+    RECIPE,
+    refresh_opacities,
+    reset_distances,
+    reset_distances_on_white,
+)
+from minisplat_ref.extensions.discretized_sdf.population import LOG_WIDTH, WIDTH, with_distances
+from minisplat_ref.extensions.discretized_sdf.reference import (
+    opacity_logits,
+    opacity_logits_vjp,
+    projected,
+    reference_sharpness,
+)
+from minisplat_ref.io.frames import place_fields
+from minisplat_ref.io.images import read_image
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, PER_SURFEL, STAGE, ReflectiveSurfels, sigmoid
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.clone_split import clone_and_split, prune_faint
+from minisplat_ref.training.losses import Rendered
+from minisplat_ref.types import Camera, Frame, Model, RenderOutput, view_from
+from scenes import make_camera, make_gaussians
+from tolerances import CLOSED_FORM
+
+
+def log_of(width):
+    return np.array([np.log(width)])
+
+
+def shared_of(width, stage=PER_PIXEL):
+    with np.errstate(divide="ignore"):
+        return {ENVIRONMENT: np.zeros((4, 8, 3)), STAGE: np.full(1, float(stage)), LOG_WIDTH: log_of(width)}
+
+
+def test_opacity_is_the_published_function_of_the_distance():
+    s = np.array([-1.3, -0.2, 1e-4, 0.0, 0.2, 1.7627471740390859])
+    gamma = 1.0
+    expected = 4 * np.exp(-gamma * s) / (1 + np.exp(-gamma * s)) ** 2
+    assert_allclose(sigmoid(opacity_logits(s, log_of(1 / gamma))), expected, rtol=CLOSED_FORM)
+    assert_allclose(expected[-1], 0.5, rtol=CLOSED_FORM)
+    o, transparency = 1 / np.cosh(1.25 * s) ** 2, np.tanh(1.25 * s) ** 2
+    v_s, _ = opacity_logits_vjp(s, log_of(0.4), o * transparency)
+    assert_allclose(v_s, -2.5 * np.tanh(1.25 * s) * o, rtol=1e-9, atol=1e-25)
+    _, v_w = opacity_logits_vjp(s, log_of(0.4), np.ones(6))
+    h = 1e-5
+    difference = opacity_logits(s, log_of(0.4) + h) - opacity_logits(s, log_of(0.4) - h)
+    assert_allclose(v_w, [np.sum(np.delete(difference, 3)) / (2 * h) + 2], rtol=1e-6)  # s = 0 counts as x -> 0: 2
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_far_and_near_distances_stay_finite(dtype):
+    s = np.array([0, 1e-30, -1e-12, 1e3, -1e6], dtype)
+    logits = opacity_logits(s, np.log(np.full(1, 0.1, dtype)))
+    assert logits.dtype == dtype and np.isfinite(logits).all()
+    assert_allclose(sigmoid(logits)[:3], 1) and (logits[3:] < -1e4).all()
+    v_s, v_w = opacity_logits_vjp(s, np.full(1, -2, dtype), np.zeros(5, dtype))
+    assert not v_s.any() and not v_w.any()
+
+
+@pytest.mark.parametrize("stage", [PER_SURFEL, PER_PIXEL])
+def test_with_gamma_of_zero_every_surfel_is_opaque_as_ref_gaussians(stage, backend, rng):
+    g = with_distances(make_gaussians(rng, 20, size=0.3), rng, foreground=0.0)
+    g = g._replace(distances=rng.normal(size=20))
+    view, request = view_from(make_camera(rng=rng)), Request(np.array([0.3, 0.2, 0.1]), backend=backend)
+    plain = ReflectiveSurfels(*g[:9])
+    images = []
+    for width in (1e300, 0.3):
+        shared = shared_of(width, stage)
+        logits = opacity_logits(g.distances, log_of(width))
+        found, _ = DISTANCED.renderer.render(Model(g, shared), view, request)
+        expected, _ = REFLECTIVE.render(Model(plain._replace(opacity_logits=logits), shared), view, request)
+        assert_array_equal(found.image, expected.image)
+        images.append(found.image)
+    opaque = plain._replace(opacity_logits=np.full(20, 1e3))
+    expected, _ = REFLECTIVE.render(Model(opaque, shared), view, request)
+    assert_array_equal(images[0], expected.image)
+    assert np.abs(images[1] - images[0]).max() > 0.01
+
+
+def test_a_start_on_the_sphere(rng):
+    gaussians = make_gaussians(rng, 40)
+    found = with_distances(gaussians, rng, foreground=0.5)
+    center = np.median(gaussians.means, axis=0)
+    away = np.linalg.norm(gaussians.means - center, axis=1)
+    rows = np.argsort(away)[:20]
+    points = projected(found.means, found.quats, found.distances)
+    assert_allclose(np.linalg.norm(points[rows] - center, axis=1), away[rows[-1]], rtol=1e-12)
+    outwards = (found.means[rows] - center) / np.linalg.norm(found.means[rows] - center, axis=1)[:, None]
+    normals = rotation_matrices(found.quats[rows])[:, :, 2]
+    assert_allclose(np.abs(np.sum(outwards * normals, axis=1)), 1, rtol=1e-12)
+    others = np.setdiff1d(np.arange(40), rows)
+    assert_array_equal(found.means[others], gaussians.means[others])
+    assert_allclose(found.opacity_logits, gaussians.opacity_logits, rtol=1e-9)
+    assert (found.distances > 0).any() and (found.distances < 0).any()
+    none = with_distances(gaussians, rng, foreground=0.0)
+    assert_array_equal(none.means, gaussians.means)
+
+
+def rendered_of(means, distances, depth=2.0, width=8, height=6, **changed):
+    """Surfels that face the camera, before a plane at a depth; the camera looks along z."""
+    n = len(means)
+    g = with_distances(make_gaussians(np.random.default_rng(0), n), np.random.default_rng(0), foreground=0.0)
+    g = g._replace(means=np.array(means, float), quats=np.tile([1.0, 0, 0, 0], (n, 1)), distances=np.array(distances))
+    camera = Camera(np.eye(3), np.zeros(3), 8.0, 8.0, width / 2, height / 2, width, height)
+    alpha = np.full((height, width), 0.5)
+    image = np.zeros((height, width, 4))
+    image[..., 3] = depth * alpha
+    output = RenderOutput(image, alpha, None, None)
+    slices = {"rgb": slice(0, 3), "depth": slice(3, 4)}
+    return Rendered(output, slices, view_from(camera), None, Model(g, shared_of(0.5)), 1, Request())._replace(**changed)
+
+
+def test_the_projection_by_hand():
+    """Depths of the projected centres 2.03, 1.96 and 2.2; the last is too far, one is beside the image, one behind."""
+    means = [[0, 0, 2.13], [0.1, 0, 1.9], [0, 0.1, 2.2], [9, 0, 2.0], [0, 0, -2.0]]
+    value, v = losses.projection(rendered_of(means, [0.1, -0.06, 0, 0, 0]), reach=0.1)
+    assert_allclose(value, (0.03 + 0.04) / 2, rtol=1e-9)
+    assert_allclose(v.gaussians["means"][:, 2], [0.5, -0.5, 0, 0, 0])
+    assert_allclose(v.gaussians["distances"], [-0.5, 0.5, 0, 0, 0])
+    assert not v.gaussians["quats"][2:].any()
+    nothing, v = losses.projection(rendered_of(means[3:], [0.0, 0.0]), reach=0.1)
+    assert nothing == 0 and not v.gaussians
+
+
+def test_the_projection_holds_the_rendered_depth():
+    rendered = rendered_of([[0, 0, 2.0]], [0.0], 2.05)
+    moved = rendered_of([[0, 0, 2.0]], [0.0], 2.01)._replace(held=rendered)
+    assert_allclose(losses.projection(moved, reach=0.1)[0], 0.05, rtol=1e-9)
+
+
+def test_the_median_by_hand():
+    s = [0.1, -0.3, 0.2]
+    assert_allclose(reference_sharpness(np.array(s)), 1.7627471740390859 / 0.2, rtol=1e-12)
+    value, v = losses.median(rendered_of(np.zeros((3, 3)), s))
+    assert_allclose(value, 1.7627471740390859 / 0.2 - 2, rtol=1e-12)
+    assert_allclose(v.shared[LOG_WIDTH], [2.0])
+    sharp = rendered_of(
+        np.zeros((3, 3)), s, model=Model(rendered_of(np.zeros((3, 3)), s).model.gaussians, shared_of(0.1))
+    )
+    assert losses.median(sharp)[0] == 0
+    assert losses.median(rendered_of(np.zeros((3, 3)), [0.0, 0.0, 0.0]))[0] == 0
+    [term] = [term for term in RECIPE.losses if term.name == "median"]
+    assert not term.is_due(1_000) and term.is_due(1_001) and term.weight == 100
+
+
+def test_the_silhouette_by_hand():
+    rendered = rendered_of(np.zeros((1, 3)), [0.0])
+    assert losses.silhouette(rendered)[0] == 0
+    mask = np.zeros((6, 8), bool)
+    mask[:, :4] = True
+    alpha = np.where(mask, 0.9, 0.2)
+    masked = rendered._replace(view=rendered.view._replace(mask=mask), output=rendered.output._replace(alpha=alpha))
+    value, v = losses.silhouette(masked)
+    assert_allclose(value, -(np.log(0.9) + np.log(0.8)) / 2, rtol=1e-12)
+    assert_allclose(v.alpha[0, [0, 7]], [-1 / 0.9 / 48, 1 / 0.8 / 48], rtol=1e-12)
+
+
+def test_density_control_by_distance(rng):
+    g = with_distances(make_gaussians(rng, 6), rng, foreground=0.0)
+    g = g._replace(distances=np.array([0.0, 0.01, -0.02, 0.3, -0.4, 0.1]))
+    moments = SimpleNamespace(distances=np.ones(6))
+    state = SimpleNamespace(gaussians=g, shared=shared_of(WIDTH), adam=SimpleNamespace(first=moments, second=moments))
+    refresh_opacities(state, None)
+    o = 1 / np.cosh(state.gaussians.distances / WIDTH / 2) ** 2
+    assert_allclose(sigmoid(state.gaussians.opacity_logits), o, rtol=1e-9)
+    kept = prune_faint(state.gaussians, min_opacity=0.05)
+    assert_array_equal(kept.parent_ids, [0, 1, 2, 5])
+    edit = clone_and_split(state.gaussians, np.ones(6), threshold=0.5, size_limit=np.inf, rng=rng)
+    assert_array_equal(edit.gaussians.distances, np.tile(g.distances, 2))
+    edit = clone_and_split(state.gaussians, np.ones(6), threshold=0.5, size_limit=0.0, rng=rng)
+    assert_array_equal(edit.gaussians.distances, np.tile(g.distances, 2))
+    signs = np.sign(g.distances)
+    white = SimpleNamespace(scene=SimpleNamespace(background=np.zeros(3)))
+    assert "not white" in reset_distances_on_white(state, white, ceiling=0.01) and moments.distances.all()
+    reset_distances(state, None, ceiling=0.01)
+    after = sigmoid(state.gaussians.opacity_logits)
+    assert_allclose(after.max(), 0.01, rtol=1e-9)
+    assert_array_equal(np.sign(state.gaussians.distances)[1:], signs[1:])
+    assert not moments.distances.any()
+
+
+def test_gamma_and_distances_scale_with_the_frame():
+    frame = Frame((0.0, 0.0, 0.0), 0.25)
+    fields = {"distances": np.array([0.5]), LOG_WIDTH: log_of(0.1)}
+    placed = place_fields(fields, DISTANCED.units, frame)
+    assert_allclose(placed["distances"], 2.0)
+    assert_allclose(opacity_logits(placed["distances"], placed[LOG_WIDTH]), opacity_logits(*fields.values()))
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sdf")
+    settings = {"n_views": 3, "width": 24, "height": 18, "n_points": 60}
+    write_scene(make_scene("glossy", supersampling=1, **settings), folder / "scene", settings)
+    train = ["train", str(folder / "scene"), "--recipe", "discretized-sdf", "--iterations", "10"]
+    assert main([*train, "--out", str(folder / "run")]) == 0
+    return folder
+
+
+def test_a_run_keeps_distances_and_gamma_and_is_relit(run_folder, capsys):
+    run, views = run_folder / "run", run_folder / "run" / "views"
+    g = EXTENSION.load(run / "point_cloud.ply", EXTENSION.representation.population)
+    with np.load(run / "shared.npz") as shared:
+        width = shared[LOG_WIDTH]
+    assert width != np.float32(np.log(WIDTH))
+    assert_allclose(g.opacity_logits, opacity_logits(g.distances, width), rtol=1e-6)
+    np.save(run_folder / "dark.npy", np.full((8, 16, 3), 0.05))
+    means = []
+    for light in ([], ["--environment", str(run_folder / "dark.npy")]):
+        assert main(["render", str(run), *light]) == 0
+        means.append(np.mean([read_image(path).mean() for path in views.glob("*.png")]))
+    assert means[1] < 0.7 * means[0]
+    assert main(["render", str(run), "--map", "normal"]) == 0
+    assert main(["train", "--resume", str(run), "--iterations", "12"]) == 0
+    assert main(["render", str(run / "point_cloud.ply")]) == 2
+    assert "no place for gamma" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.fixture
+def small_study(monkeypatch):
+    for name, value in {"WIDTH_PX": 24, "HEIGHT_PX": 18, "N_SURFELS": 300, "STEPS": 8, "N_VIEWS": 2}.items():
+        monkeypatch.setattr(study, name, value)
+
+
+def test_the_sphere_is_measured_as_it_says(small_study):
+    rng = np.random.default_rng(0)
+    g, truths = study.noisy_sphere(rng), [study.trace(camera) for camera in study.cameras(rng, 2)]
+    for truth in truths:
+        assert_allclose(np.linalg.norm(truth.normals, axis=1), 1, rtol=1e-9)
+        in_camera = truth.normals @ truth.camera.cam_from_world_R[2] + truth.camera.cam_from_world_t[2]
+        assert_allclose(in_camera, truth.depth, rtol=1e-9)
+    exact = g._replace(distances=np.linalg.norm(g.means, axis=1) - 1)
+    found = study.measure(exact, study.opacities(exact, WIDTH), truths)
+    assert found["radius_error"] < 1e-9 and found["consistency"] < 1e-9
+    assert_allclose(found["slope"], 1, atol=0.02)  # normals of neighbours differ
+    farther = exact._replace(
+        means=1.2 * exact.means / np.linalg.norm(exact.means, axis=1)[:, None], distances=0 * g.distances
+    )
+    assert study.measure(farther, np.full(300, 9.0), truths)["depth_bias"] < -0.1
+    moved, logits = study.project_sphere(exact, truths, study.ARMS[0])
+    assert_array_equal(moved.quats, g.quats)
+    assert (moved.distances != exact.distances).any() and (logits < study.opacities(moved, WIDTH)).any()
+
+
+def test_the_albedo_is_compared_up_to_a_factor(small_study):
+    """A renderer of the truth has no error, whatever the factor; one of a wrong albedo has."""
+    _, truths = study.glossy_sphere(np.random.default_rng(0))
+    shared = {ENVIRONMENT: np.zeros((4, 8, 3))}
+
+    def render(model, view, request, factor=0.5):
+        truth = study.trace(view.camera)
+        light = study._light(0 if model.shared[ENVIRONMENT] is shared[ENVIRONMENT] else 1)
+        image = np.zeros((18, 24, 6))
+        image[..., :3] = study.photograph(truth, light) + 1e-7
+        image[truth.is_sphere, 3:] = study.albedo_at(truth.normals) ** (1 if factor else 2) * 0.5
+        if "albedo" not in request.wants:
+            image = image[..., :3]
+        return RenderOutput(image, truth.is_sphere.astype(float), None, None), None
+
+    found, _ = study.compare(Model(None, shared), render, truths)
+    assert found["albedo_error"] < 1e-9 and found["psnr"] > 100
+    assert found["relit_psnr"] > 30  # clipped highlights are not scaled exactly
+    wrong, _ = study.compare(Model(None, shared), lambda *a: render(*a, factor=0), truths)
+    assert wrong["albedo_error"] > 0.02
