@@ -144,7 +144,7 @@ ORDER = (
                 "discs with depths and normals; from depth maps to a mesh",
             ),
             Step(
-                ("mechanisms/gbuffer/", "extensions/reflective/"),
+                ("mechanisms/gbuffer/", "mechanisms/reflective/", "extensions/reflective/"),
                 (),
                 "materials blended and shaded once per pixel, in an environment that is learned",
             ),

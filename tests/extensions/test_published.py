@@ -484,7 +484,7 @@ CONSTANTS = [
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
-    ("reflective.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
+    ("mechanisms.reflective.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
     ("surfels.losses", "NEAR", 0.2, "2DGS, released code"),
     ("surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
@@ -548,7 +548,8 @@ def test_every_recipe_with_a_paper_has_a_table():
 
 @pytest.mark.parametrize(("module", "name", "value", "source"), CONSTANTS)
 def test_a_constant_is_the_published_one(module, name, value, source):
-    assert getattr(import_module(f"minisplat_ref.extensions.{module}"), name) == pytest.approx(value, rel=1e-6), source
+    package = "minisplat_ref" if module.startswith("mechanisms.") else "minisplat_ref.extensions"
+    assert getattr(import_module(f"{package}.{module}"), name) == pytest.approx(value, rel=1e-6), source
 
 
 @pytest.mark.parametrize("event", [During, SmallerViews])

@@ -10,7 +10,12 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.reflective import study
 from minisplat_ref.extensions.reflective.method import RECIPE, shade_by, spread_normals
-from minisplat_ref.extensions.reflective.population import (
+from minisplat_ref.io.images import read_image
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter
+from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
+from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.mechanisms.reflective.population import (
     PER_PIXEL,
     PER_SURFEL,
     STAGE,
@@ -20,12 +25,7 @@ from minisplat_ref.extensions.reflective.population import (
     sigmoid,
     with_materials,
 )
-from minisplat_ref.extensions.reflective.renderer import REFLECTIVE, render
-from minisplat_ref.io.images import read_image
-from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter
-from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
-from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.mechanisms.reflective.renderer import REFLECTIVE, render
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.pinhole import pinhole_rays

@@ -14,19 +14,19 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
-from minisplat_ref.extensions.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
+from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
+from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.mechanisms.reflective.population import (
     PER_PIXEL,
     PER_SURFEL,
     STAGE,
     WITH_OCCLUSION,
     ReflectiveSurfels,
 )
-from minisplat_ref.extensions.reflective.renderer import REFLECTIVE
-from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
-from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
-from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
-from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.mechanisms.reflective.renderer import REFLECTIVE
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
