@@ -1,0 +1,196 @@
+"""Texels from maps: normals and materials of some views, baked into the textures of surfels that stay where they are.
+
+What is blended is linear in the texels X, so the best ones for targets m, weighed by the opacity A of pixels, are
+those of a linear least-squares problem::
+
+    min over X of sum over pixels |sum_gt w_g h_gt X_gt - A m|^2
+
+with the weight w of a hit times the share h of a texel in what it reads. The first guess is the mean of the targets
+that a texel is read for, ``sum w h m / sum w h``; conjugate gradients on the normal equations, with ``sum w h`` as the
+preconditioner, go on from there. Both products with the matrix are the blend and its gradient, so it is never stored.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
+
+from minisplat_ref.backends import Backend, get_backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.texture_splat import kernels, reference
+from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, texels_of
+from minisplat_ref.extensions.texture_splat.reference import raw_normals, tangent_normals
+from minisplat_ref.extensions.texture_splat.renderer import disc_axes
+from minisplat_ref.mechanisms.reflective.population import sigmoid
+from minisplat_ref.mechanisms.surfels import renderer as discs
+from minisplat_ref.mechanisms.surfels.projection import Surfels
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Bools, Camera, Floats, Model, TileBins, view_from
+
+SHARE_MIN = 1e-3  # of a material, so that its logit is finite
+READ_MIN = 1e-6  # sum of w h, in pixels, below which a texel is not seen
+RESIDUAL = 1e-6  # of the normal equations, relative to their right side
+
+
+class Maps(NamedTuple):
+    """What a view should show: the targets of baking."""
+
+    camera: Camera
+    normals: Floats
+    """[H, W, 3] unit, world frame, towards the camera."""
+    materials: Floats
+    """[H, W, 5] albedo, metallic share, roughness."""
+    is_known: Bools
+    """[H, W] pixels that count."""
+
+
+class _Sight(NamedTuple):
+    """The linear map from texels, with normals in the world and turned as the discs are, to the channels of a view."""
+
+    surfels: Surfels
+    bins: TileBins
+    conventions: Conventions
+    module: Any  # kernels or reference
+    signs: Floats  # [N, 1, 1] of normals: whether that of the disc, or its opposite, is towards the camera
+    is_known: Bools  # [H, W, 1]
+
+    def forward(self, texels: Floats) -> Floats:
+        """Return the channels [H, W, 8]; 0 where nothing counts."""
+        image = self.module.blend_texels(self.surfels, self._turn(texels), self.bins, self.conventions)
+        return np.where(self.is_known, image, 0)
+
+    def adjoint(self, image: Floats, texels: Floats) -> Floats:
+        """Return the product [N, T^2, 8] of the transposed map with channels; ``texels`` only have their shape."""
+        v = self.module.blend_texels_vjp(
+            self.surfels,
+            np.zeros_like(texels),
+            self.bins,
+            self.conventions,
+            np.zeros_like(image),
+            np.where(self.is_known, image, 0),
+        )
+        return self._turn(v.texels)
+
+    def _turn(self, texels: Floats) -> Floats:
+        return np.concatenate([texels[:, :, :3] * self.signs, texels[:, :, 3:]], axis=2)
+
+
+def bake(
+    population: TexturedSurfels, views: Sequence[Maps], *, steps: int = 30, backend: Backend | None = None
+) -> TexturedSurfels:
+    """Return the surfels with textures that show the maps of the views best.
+
+    Parameters
+    ----------
+    population : TexturedSurfels
+        Texels that no view sees keep their values.
+    views : sequence of Maps
+        Normals and materials as they should be seen.
+    steps : int
+        Of conjugate gradients; with 0 each texel is the mean of the targets that it is read for.
+    backend : Backend, optional
+        ``cpu`` by default.
+
+    Raises
+    ------
+    InputError
+        There are no views, or the maps of one do not have the size of its camera's image.
+    """
+    if not views:
+        raise InputError("textures are baked from the maps of views: give at least one view")
+    backend = get_backend("cpu") if backend is None else backend
+    texels = _world_texels(population)
+    sights = [_look(population, maps, backend) for maps in views]
+    targets = [np.concatenate([maps.normals, maps.materials], axis=2).astype(texels.dtype) for maps in views]
+    read, wanted, means = np.zeros_like(texels), np.zeros_like(texels), np.zeros_like(texels)
+    for sight, target in zip(sights, targets, strict=True):
+        ones = np.ones_like(target)
+        unsigned = sight._replace(signs=np.ones_like(sight.signs))
+        read += unsigned.adjoint(ones, texels)
+        alpha = unsigned.forward(np.ones_like(texels))
+        means += sight.adjoint(target, texels)
+        wanted += sight.adjoint(alpha * target, texels)
+    is_read = read > READ_MIN
+    start = np.where(is_read, means / np.where(is_read, read, 1), texels)
+    if steps:
+
+        def product(flat: Floats) -> Floats:
+            x = np.where(is_read, flat.reshape(texels.shape), 0)
+            total: Floats = sum(sight.adjoint(sight.forward(x), x) for sight in sights)
+            return np.where(is_read, total, 0).ravel()
+
+        n = texels.size
+        unread = np.where(is_read, 0, texels)
+        residual = wanted - sum(sight.adjoint(sight.forward(unread), texels) for sight in sights)
+        solved, _ = cg(
+            LinearOperator((n, n), matvec=product, dtype=texels.dtype),
+            np.where(is_read, residual, 0).ravel(),
+            np.where(is_read, start, 0).ravel(),
+            rtol=RESIDUAL,
+            maxiter=steps,
+            M=LinearOperator((n, n), matvec=lambda flat: flat / np.where(is_read, read, 1).ravel(), dtype=texels.dtype),
+        )
+        start = np.where(is_read, solved.reshape(texels.shape), texels)
+    return _with_texels(population, start, is_read.any(axis=2))
+
+
+def _look(population: TexturedSurfels, maps: Maps, backend: Backend) -> _Sight:
+    """Return how a view reads the texels.
+
+    Raises
+    ------
+    InputError
+        A map does not have the size of the camera's image.
+    """
+    camera = maps.camera
+    sizes = {name: getattr(maps, name).shape[:2] for name in ("normals", "materials", "is_known")}
+    for name, size in sizes.items():
+        if size != (camera.height, camera.width):
+            raise InputError(
+                f"{name} have {size[1]} x {size[0]} pixels and the camera {camera.width} x {camera.height}: make the"
+                " maps as large as the image"
+            )
+    request = Request(backend=backend)
+    seen = discs.look(Model(population), view_from(camera), request)
+    bins = discs.list_tiles(seen.surfels, camera, request.conventions, backend)
+    _, signs = disc_axes(seen)
+    dtype = population.means.dtype
+    module = kernels if backend.is_compiled else reference
+    return _Sight(
+        seen.surfels, bins, request.conventions, module, signs[:, :, None].astype(dtype), maps.is_known[:, :, None]
+    )
+
+
+def _world_texels(population: TexturedSurfels) -> Floats:
+    """Return the texels [N, T^2, 8] that the population has, normals in the world."""
+    n, size = len(population.means), texels_of(population)
+    axes = rotation_matrices(population.quats)
+    tangent = tangent_normals(population.normal_textures.reshape(n, size * size, 2))
+    normals = tangent @ np.swapaxes(axes, 1, 2)
+    albedo = sigmoid(population.albedo_logits).reshape(n, size * size, 3)
+    shares = np.stack([sigmoid(population.metallic_logits), sigmoid(population.roughness_logits)], axis=2)
+    return np.ascontiguousarray(np.concatenate([normals, albedo, shares], axis=2), population.means.dtype)
+
+
+def _with_texels(population: TexturedSurfels, texels: Floats, is_read: Bools) -> TexturedSurfels:
+    """Return the population with texels as :func:`_world_texels` has them, where ``is_read`` [N, T^2]."""
+    raw = raw_normals(texels[:, :, :3] @ rotation_matrices(population.quats))
+    shares = np.clip(texels[:, :, 3:], SHARE_MIN, 1 - SHARE_MIN)
+    logits = np.log(shares) - np.log1p(-shares)
+    found = {
+        "normal_textures": raw,
+        "albedo_logits": logits[:, :, :3],
+        "metallic_logits": logits[:, :, 3:4],
+        "roughness_logits": logits[:, :, 4:],
+    }
+
+    def chosen(name: str, values: Floats) -> Floats:
+        before = getattr(population, name)
+        return np.where(is_read[:, :, None], values, before.reshape(values.shape)).reshape(before.shape)
+
+    return population._replace(
+        **{name: chosen(name, values).astype(population.means.dtype) for name, values in found.items()}
+    )
