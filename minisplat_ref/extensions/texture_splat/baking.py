@@ -6,15 +6,16 @@ those of a linear least-squares problem::
     min over X of sum over pixels |sum_gt w_g h_gt X_gt - A m|^2
 
 with the weight w of a hit times the share h of a texel in what it reads. The first guess is the mean of the targets
-that a texel is read for, ``sum w h m / sum w h``; conjugate gradients on the normal equations, with ``sum w h`` as the
-preconditioner, go on from there. Both products with the matrix are the blend and its gradient, so it is never stored.
+that a texel is read for, ``sum w h m / sum w h``. Accelerated projected gradients (Beck and Teboulle 2009) go on from
+there, among texels that can be stored: shares between 0 and 1, normals of unit length. The step of a texel is ``1 / sum
+w h``, which is short enough, as the w h of a pixel are positive and sum up to at most 1. Both products with the matrix
+are the blend and its gradient, so it is never stored.
 """
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, cg
 
 from minisplat_ref.backends import Backend, get_backend
 from minisplat_ref.constants import Conventions
@@ -32,7 +33,6 @@ from minisplat_ref.types import Bools, Camera, Floats, Model, TileBins, view_fro
 
 SHARE_MIN = 1e-3  # of a material, so that its logit is finite
 READ_MIN = 1e-6  # sum of w h, in pixels, below which a texel is not seen
-RESIDUAL = 1e-6  # of the normal equations, relative to their right side
 
 
 class Maps(NamedTuple):
@@ -79,7 +79,7 @@ class _Sight(NamedTuple):
 
 
 def bake(
-    population: TexturedSurfels, views: Sequence[Maps], *, steps: int = 30, backend: Backend | None = None
+    population: TexturedSurfels, views: Sequence[Maps], *, steps: int = 50, backend: Backend | None = None
 ) -> TexturedSurfels:
     """Return the surfels with textures that show the maps of the views best.
 
@@ -90,7 +90,7 @@ def bake(
     views : sequence of Maps
         Normals and materials as they should be seen.
     steps : int
-        Of conjugate gradients; with 0 each texel is the mean of the targets that it is read for.
+        Of the gradient; with 0 each texel is the mean of the targets that it is read for.
     backend : Backend, optional
         ``cpu`` by default.
 
@@ -114,27 +114,29 @@ def bake(
         means += sight.adjoint(target, texels)
         wanted += sight.adjoint(alpha * target, texels)
     is_read = read > READ_MIN
-    start = np.where(is_read, means / np.where(is_read, read, 1), texels)
-    if steps:
+    steps_of = np.where(is_read, 1 / np.where(is_read, read, 1), 0)
+    axes = rotation_matrices(population.quats)
+    best = ahead = _nearest(np.where(is_read, means * steps_of, texels), axes)
+    momentum = 1.0
+    for _ in range(steps):
+        moved = _nearest(ahead - steps_of * (_normal_product(sights, ahead) - wanted), axes)
+        before, momentum = momentum, (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        best, ahead = moved, moved + (before - 1) / momentum * (moved - best)
+    return _with_texels(population, best, is_read[:, :, 0])
 
-        def product(flat: Floats) -> Floats:
-            x = np.where(is_read, flat.reshape(texels.shape), 0)
-            total: Floats = sum(sight.adjoint(sight.forward(x), x) for sight in sights)
-            return np.where(is_read, total, 0).ravel()
 
-        n = texels.size
-        unread = np.where(is_read, 0, texels)
-        residual = wanted - sum(sight.adjoint(sight.forward(unread), texels) for sight in sights)
-        solved, _ = cg(
-            LinearOperator((n, n), matvec=product, dtype=texels.dtype),
-            np.where(is_read, residual, 0).ravel(),
-            np.where(is_read, start, 0).ravel(),
-            rtol=RESIDUAL,
-            maxiter=steps,
-            M=LinearOperator((n, n), matvec=lambda flat: flat / np.where(is_read, read, 1).ravel(), dtype=texels.dtype),
-        )
-        start = np.where(is_read, solved.reshape(texels.shape), texels)
-    return _with_texels(population, start, is_read.any(axis=2))
+def _nearest(texels: Floats, axes: Floats) -> Floats:
+    """Return texels that can be stored: shares within their bounds, unit normals on the side of the disc's normal."""
+    normals = tangent_normals(raw_normals(texels[:, :, :3] @ axes)) @ np.swapaxes(axes, 1, 2)
+    return np.concatenate([normals, np.clip(texels[:, :, 3:], SHARE_MIN, 1 - SHARE_MIN)], axis=2)
+
+
+def _normal_product(sights: Sequence[_Sight], texels: Floats) -> Floats:
+    """Return the matrix of the normal equations times texels."""
+    total = np.zeros_like(texels)
+    for sight in sights:
+        total += sight.adjoint(sight.forward(texels), texels)
+    return total
 
 
 def _look(population: TexturedSurfels, maps: Maps, backend: Backend) -> _Sight:
@@ -178,8 +180,7 @@ def _world_texels(population: TexturedSurfels) -> Floats:
 def _with_texels(population: TexturedSurfels, texels: Floats, is_read: Bools) -> TexturedSurfels:
     """Return the population with texels as :func:`_world_texels` has them, where ``is_read`` [N, T^2]."""
     raw = raw_normals(texels[:, :, :3] @ rotation_matrices(population.quats))
-    shares = np.clip(texels[:, :, 3:], SHARE_MIN, 1 - SHARE_MIN)
-    logits = np.log(shares) - np.log1p(-shares)
+    logits = np.log(texels[:, :, 3:]) - np.log1p(-texels[:, :, 3:])
     found = {
         "normal_textures": raw,
         "albedo_logits": logits[:, :, :3],
