@@ -144,7 +144,12 @@ ORDER = (
                 "discs with depths and normals; from depth maps to a mesh",
             ),
             Step(
-                ("mechanisms/gbuffer/", "mechanisms/reflective/", "extensions/reflective/"),
+                (
+                    "mechanisms/gbuffer/",
+                    "mechanisms/reflective/",
+                    "extensions/reflective/",
+                    "extensions/texture_splat/",
+                ),
                 (),
                 "materials blended and shaded once per pixel, in an environment that is learned",
             ),

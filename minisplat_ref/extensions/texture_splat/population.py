@@ -15,7 +15,7 @@ from minisplat_ref.mechanisms.reflective.population import PER_PIXEL, STAGE, Ref
 from minisplat_ref.mechanisms.reflective.population import first_light as first_light_of_reflective
 from minisplat_ref.types import Floats, Gaussians, Scene
 
-CHANNELS = {"normal_textures": 2, "albedo_logits": 3, "metallic_logits": 1, "roughness_logits": 1}
+CHANNELS = {"metallic_logits": 1, "roughness_logits": 1, "albedo_logits": 3, "normal_textures": 2}
 """The textures, and how many channels each has."""
 
 
