@@ -169,6 +169,7 @@ def test_the_whole_renderer_has_its_gradient(backend):
     """Every input along a random direction; ``oracle gradients --extension texture-splat`` checks all entries."""
     rng = np.random.default_rng(SEED)
     (stage,) = EXTENSION.stages(backend, tiny_setting(), rng)
+    assert stage.inputs["normal_textures"].shape[1] == 2 * 3 * 3
     case = inner_product_case(stage, rng)
     assert case.passed and case.figures["error"] < 1e-8, case
 
@@ -295,6 +296,10 @@ def test_what_no_view_sees_stays(rng):
         bake(both, [])
     with pytest.raises(InputError, match="materials have 31 x 24 pixels and the camera 32 x 24"):
         bake(both, [views[0]._replace(materials=views[0].materials[:, 1:])])
+    holed = np.where(views[0].is_known[:, :, None], views[0].normals, np.nan)
+    assert_array_equal(bake(both, [views[0]._replace(normals=holed)], steps=2).normal_textures, found.normal_textures)
+    with pytest.raises(InputError, match="normals are not finite in some pixels that count"):
+        bake(both, [views[0]._replace(normals=np.full_like(holed, np.nan))])
 
 
 # --- the recipe and its files ---

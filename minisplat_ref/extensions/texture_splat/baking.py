@@ -58,12 +58,12 @@ class _Sight(NamedTuple):
     is_known: Bools  # [H, W, 1]
 
     def forward(self, texels: Floats) -> Floats:
-        """Return the channels [H, W, 8]; 0 where nothing counts."""
-        image = self.module.blend_texels(self.surfels, self._turn(texels), self.bins, self.conventions)
-        return np.where(self.is_known, image, 0)
+        """Return the channels [H, W, 8]."""
+        image: Floats = self.module.blend_texels(self.surfels, self._turn(texels), self.bins, self.conventions)
+        return image
 
     def adjoint(self, image: Floats, texels: Floats) -> Floats:
-        """Return the product [N, T^2, 8] of the transposed map with channels; ``texels`` only have their shape."""
+        """Return the product of the transposed map with the channels of pixels that count, in the shape of texels."""
         v = self.module.blend_texels_vjp(
             self.surfels,
             np.zeros_like(texels),
@@ -97,7 +97,7 @@ def bake(
     Raises
     ------
     InputError
-        There are no views, or the maps of one do not have the size of its camera's image.
+        There are no views, or the maps of one do not have the size of its camera's image or are not finite.
     """
     if not views:
         raise InputError("textures are baked from the maps of views: give at least one view")
@@ -145,16 +145,18 @@ def _look(population: TexturedSurfels, maps: Maps, backend: Backend) -> _Sight:
     Raises
     ------
     InputError
-        A map does not have the size of the camera's image.
+        A map does not have the size of the camera's image, or is not finite where it counts.
     """
     camera = maps.camera
-    sizes = {name: getattr(maps, name).shape[:2] for name in ("normals", "materials", "is_known")}
+    sizes = {name: getattr(maps, name).shape[:2] for name in ("is_known", "normals", "materials")}
     for name, size in sizes.items():
         if size != (camera.height, camera.width):
             raise InputError(
                 f"{name} have {size[1]} x {size[0]} pixels and the camera {camera.width} x {camera.height}: make the"
                 " maps as large as the image"
             )
+        if not np.isfinite(getattr(maps, name)[maps.is_known]).all():
+            raise InputError(f"{name} are not finite in some pixels that count: take these out of is_known")
     request = Request(backend=backend)
     seen = discs.look(Model(population), view_from(camera), request)
     bins = discs.list_tiles(seen.surfels, camera, request.conventions, backend)

@@ -205,26 +205,34 @@ def compare(test: list[Maps], albedo: tuple[Floats, ...], normals: tuple[Floats,
 
 
 def table(records: list[dict[str, Any]]) -> str:
-    """Return the tables: more surfels first."""
+    """Return the tables: first how much textures are ahead, seed by seed, where they cost most; then all arms."""
+
+    def of(arm: str, size: int, key: str, steps: int = STEPS) -> list[Any]:
+        return [r[key] for r in records if (r["arm"], r["T"], r["steps"]) == (arm, size, steps)]
+
+    def ahead(arm: str, size: int, key: str) -> str:
+        return with_deviation([a - b for a, b in zip(of(TEXTURES, size, key), of(arm, size, key), strict=True)], 2)
+
+    measures = {"albedo_psnr": "albedo (dB)", "normal_psnr": "normals (dB)"}
+    gains = [
+        [str(size), str(degree), *(ahead(arm, size, key) for key in measures)]
+        for arm, degree in ((FEWEST, 0), (MORE, 3))
+        for size in SIZES[1:]
+    ]
     rows = []
     for size in SIZES:
-        for arm in COLORS:
-            of = [r for r in records if (r["arm"], r["T"]) == (arm, size)]
-            best, means = ([r for r in of if r["steps"] == steps] for steps in (STEPS, 0))
-            if not best:
-                continue
-            numbers = [f"{np.mean([r[key] for r in best]):,.0f}" for key in ("surfels",)]
-            numbers += [f"{np.mean([r['floats'][degree] for r in best]):,.0f}" for degree in LIGHTS]
-            measures = [
-                with_deviation([r[key] for r in of_steps], digits)
-                for key, digits in (("albedo_psnr", 2), ("normal_psnr", 2), ("angle", 2))
-                for of_steps in (best,)
-            ]
-            of_means = [with_deviation([r[key] for r in means], 2) for key in ("albedo_psnr", "normal_psnr")]
-            rows.append([f"T = {size}" if arm == TEXTURES else arm, *numbers, *measures, *of_means])
-    heading = ["", "surfels", "floats, degree 3", "degree 0", "albedo (dB)", "normals (dB)", "off by (degrees)"]
-    return "test views; least squares, and in the last two columns texels that are weighted means\n\n" + markdown_table(
-        [*heading, "albedo, means", "normals, means"], rows
+        for arm in (FEWEST, MORE, TEXTURES) if size > 1 else (TEXTURES,):
+            degrees = [f"{np.mean([f[degree] for f in of(arm, size, 'floats')]):,.0f}" for degree in LIGHTS]
+            name = f"T = {size}" if arm == TEXTURES else f"as many floats as T = {size}, degree {arm[-1]}"
+            numbers = [f"{np.mean(of(arm, size, 'surfels')):,.0f}", *degrees]
+            solved = [with_deviation(of(arm, size, key), 2) for key in (*measures, "angle")]
+            rows.append([name, *numbers, *solved, *(with_deviation(of(arm, size, key, 0), 2) for key in measures)])
+    heading = ["", "surfels", "floats, degree 3", "degree 0", *measures.values(), "off by (degrees)"]
+    return (
+        "how far textures are ahead of more surfels with as many floats, by the degree of the light\n\n"
+        f"{markdown_table(['T', 'degree', *measures.values()], gains)}\n\n"
+        "test views; least squares, and in the last two columns texels that are weighted means\n\n"
+        f"{markdown_table([*heading, 'albedo, means', 'normals, means'], rows)}"
     )
 
 
@@ -245,11 +253,11 @@ def draw(records: list[dict[str, Any]], truth: Maps, shown: dict[tuple[str, int]
                     points.append((x, *mean_and_deviation([r[key] for r in own])))
                 x, y, error = np.transpose(points)
                 axes.errorbar(x, y, error, marker="o", color=COLORS[arm], label=arm.partition(",")[0])
+            axes.legend()
             axes.set_xscale("log")
-            axes.xaxis.set_major_formatter("{x:g}")
+            axes.set_xticks((3, 10, 30), ("3", "10", "30"), minor=False)
             axes.xaxis.set_minor_formatter("")
             axes.set(xlabel=f"thousands of floats, degree {degree}", ylabel=f"{name}: PSNR (dB)")
-    all_axes[0].legend()
     columns = [(TEXTURES, size) for size in SIZES] + [(MORE, SIZES[-1])]
     axes = bottom.subplots(2, 1 + len(columns))
     pictures = [("truth", truth.materials[:, :, :3], truth.normals)]
