@@ -12,6 +12,7 @@ functions U, V, W of the pixel, ``u = U / W``, ``z = 1 / W``, a derivative with 
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,20 @@ from minisplat_ref.types import Floats, TileBins
 
 _PER_SIGMA = np.float32(1 / REACH)
 AT_U, AT_V, READ, V_U, V_V, N_BUFFER = range(1, 7)  # of a hit's numbers, in units of eight, after the weight
+
+
+class Sums(NamedTuple):
+    """Gradients of the surfels that a tile lists."""
+
+    records: Floats  # [M * n_gradients * 8]
+    texels: Floats  # [M, 8 T^2]
+
+
+class Channels(NamedTuple):
+    """What was blended, and the derivative of the loss with respect to it."""
+
+    image: Floats  # [H * W, 8]
+    v_image: Floats  # [H * W, 8]
 
 
 @scalar
@@ -141,59 +156,62 @@ def backward_kernel(response: KernelResponse) -> Callable:
         )
 
     @scalar
-    def chain_row(sums, v_texels, buffer, v_place, primitives, size, row, frame, image, v_image):
+    def chain_row(sums, buffer, v_place, primitives, size, row, frame, channels):
         T, pixels = full_transmittance(row, frame, buffer.dtype.type), row_pixels(row, frame)
         first = row.y * frame.width + row.x
         behind = ZERO * T
         for k in range(N_CHANNELS):
-            behind = behind + gather(image, pixels, k) * gather(v_image, pixels, k)
+            behind = behind + gather(channels.image, pixels, k) * gather(channels.v_image, pixels, k)
         for m in row.members:
             n, before = row.ids[m], T
             unclamped, _, place = hit_row(hit, primitives, n, row)
-            u, v, z, dx, dy = place[1], place[2], place[3], place[4], place[5]
+            at_u, at_v, z, dx, dy = place[1], place[2], place[3], place[4], place[5]
             T, w = blend(before, unclamped, frame)
             store(buffer, 0, w)
-            store(buffer, AT_U * WIDTH, u)
-            store(buffer, AT_V * WIDTH, v)
+            store(buffer, AT_U * WIDTH, at_u)
+            store(buffer, AT_V * WIDTH, at_v)
             buffer[READ * WIDTH :] = ZERO
             for lane in range(WIDTH):
                 if buffer[lane] > ZERO:
-                    read_vjp(buffer, v_texels[m], primitives.colors, n, size, v_image[first + lane], lane)
+                    v = channels.v_image[first + lane]
+                    read_vjp(buffer, sums.texels[m], primitives.colors, n, size, v, lane)
             v_dot_X = load(buffer, READ * WIDTH)
             behind = behind - w * v_dot_X
             v_alpha = blend_vjp(before, w, unclamped, behind, v_dot_X, frame)
             v_mean = select(unclamped <= frame.mean_gradient_max, v_alpha, ZERO)
             v_shape = select(unclamped <= frame.shape_gradient_max, v_alpha, ZERO)
             at = m * n_gradients * WIDTH
-            accumulate(sums, at, hit_vjp(primitives.records, n, place, v_mean, v_shape, v_place))
+            accumulate(sums.records, at, hit_vjp(primitives.records, n, place, v_mean, v_shape, v_place))
             v_u, v_v = load(buffer, V_U * WIDTH), load(buffer, V_V * WIDTH)
-            v_U, v_V, v_W = z * v_u, z * v_v, -z * (u * v_u + v * v_v)
-            accumulate(sums, at + U * WIDTH, (v_U * dx, v_U * dy, v_U))
-            accumulate(sums, at + V * WIDTH, (v_V * dx, v_V * dy, v_V))
-            accumulate(sums, at + W * WIDTH, (v_W * dx, v_W * dy, v_W))
+            v_U, v_V, v_W = z * v_u, z * v_v, -z * (at_u * v_u + at_v * v_v)
+            accumulate(sums.records, at + U * WIDTH, (v_U * dx, v_U * dy, v_U))
+            accumulate(sums.records, at + V * WIDTH, (v_V * dx, v_V * dy, v_V))
+            accumulate(sums.records, at + W * WIDTH, (v_W * dx, v_W * dy, v_W))
             if not reduce_any(T > ZERO):
                 break
 
     @kernel()
-    def blend_tiles_vjp(primitives, size, lists, frame, n_threads, image, v_image, slots):
+    def blend_tiles_vjp(primitives, size, lists, frame, n_threads, channels, slots):
         taken = make_shared_counter()
         for _ in prange(n_threads):
             buffer, v_place = np.empty(N_BUFFER * WIDTH, slots.dtype), np.zeros(WIDTH, slots.dtype)
             for tile in dynamic_range(taken, lists.offsets.size - 1):
                 first, n_listed = lists.offsets[tile], lists.offsets[tile + 1] - lists.offsets[tile]
-                sums = np.zeros(n_listed * n_gradients * WIDTH, slots.dtype)
-                v_texels = np.zeros((n_listed, primitives.colors.shape[1]), slots.dtype)
+                sums = Sums(
+                    np.zeros(n_listed * n_gradients * WIDTH, slots.dtype),
+                    np.zeros((n_listed, primitives.colors.shape[1]), slots.dtype),
+                )
                 members, counts = list_rows(primitives.boxes, tile, lists, frame)
                 for i in range(counts.size):
                     row = row_of_tile(i, tile, members, counts, lists, frame)
                     if row.x < frame.width and row.y < frame.height:
-                        chain_row(sums, v_texels, buffer, v_place, primitives, size, row, frame, image, v_image)
+                        chain_row(sums, buffer, v_place, primitives, size, row, frame, channels)
                 for m in range(n_listed):
                     slot = lists.slots[first + m]
                     for j in range(n_gradients):
-                        slots[slot, j] = reduce_sum(load(sums, (m * n_gradients + j) * WIDTH))
-                    for j in range(v_texels.shape[1]):
-                        slots[slot, n_gradients + j] = v_texels[m, j]
+                        slots[slot, j] = reduce_sum(load(sums.records, (m * n_gradients + j) * WIDTH))
+                    for j in range(sums.texels.shape[1]):
+                        slots[slot, n_gradients + j] = sums.texels[m, j]
 
     return blend_tiles_vjp
 
@@ -231,8 +249,7 @@ def blend_texels_vjp(
         lists_of(bins, response),
         frame_of(bins, conventions, dtype),
         n_threads(),
-        np.ascontiguousarray(image, dtype).reshape(-1, N_CHANNELS),
-        np.ascontiguousarray(v_image, dtype).reshape(-1, N_CHANNELS),
+        Channels(*(np.ascontiguousarray(array, dtype).reshape(-1, N_CHANNELS) for array in (image, v_image))),
         slots,
     )
     totals = np.zeros((len(texels), slots.shape[1]))
