@@ -341,9 +341,9 @@ def test_a_run_shows_its_maps_and_can_be_continued(runs, capsys):
 
 def test_bad_input_gets_one_line(runs, capsys):
     scene = ["train", str(runs / "scene"), "--recipe", "texture-splat", "--iterations", "1"]
-    for init in ([], ["--init", str(runs / "reflective")]):
-        assert main([*scene, *init, "--set", "texels=0", "--out", str(runs / "none")]) == 2
-        assert "a texture of 0 x 0 texels does not exist" in capsys.readouterr().err.splitlines()[-1]
+    for size, init in (("0", []), ("-2", ["--init", str(runs / "reflective")]), ("None", [])):
+        assert main([*scene, *init, "--set", f"texels={size}", "--out", str(runs / "none")]) == 2
+        assert f"a texture of {size} x {size} texels does not exist" in capsys.readouterr().err.splitlines()[-1]
         assert not (runs / "none").exists()
     surfels = EXTENSION.load(runs / "textured" / "point_cloud.ply", TexturedSurfels)
     for name, columns, said in (

@@ -99,7 +99,7 @@ def resized(population: TexturedSurfels, size: int) -> TexturedSurfels:
     InputError
         ``size`` is below 1.
     """
-    if size < 1:
+    if not size or size < 1:  # --set texels=none is None
         raise InputError(f"a texture of {size} x {size} texels does not exist: give --set texels=1 or more")
     before, n = texels_of(population), len(population.means)
     at = np.linspace(0, before - 1, size) if size > 1 else np.array([(before - 1) / 2])
