@@ -146,7 +146,6 @@ ORDER = (
             Step(
                 (
                     "mechanisms/gbuffer/",
-                    "mechanisms/reflective/",
                     "extensions/reflective/",
                     "extensions/texture_splat/",
                 ),

@@ -503,7 +503,7 @@ CONSTANTS = [
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
-    ("mechanisms.reflective.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
+    ("mechanisms.gbuffer.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
     ("surfels.losses", "NEAR", 0.2, "2DGS, released code"),
     ("surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("texture_splat.reference", "REACH", 4.0, "TextureSplat, released code"),

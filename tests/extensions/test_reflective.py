@@ -15,7 +15,7 @@ from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
 from minisplat_ref.mechanisms.gbuffer.tone import tone
-from minisplat_ref.mechanisms.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     PER_SURFEL,
     STAGE,
@@ -25,7 +25,7 @@ from minisplat_ref.mechanisms.reflective.population import (
     sigmoid,
     with_materials,
 )
-from minisplat_ref.mechanisms.reflective.renderer import REFLECTIVE, render
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.pinhole import pinhole_rays

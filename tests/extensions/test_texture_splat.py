@@ -23,7 +23,7 @@ from minisplat_ref.extensions.texture_splat.renderer import TEXTURED
 from minisplat_ref.io import load_ply, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     PER_SURFEL,
     STAGE,
@@ -31,7 +31,7 @@ from minisplat_ref.mechanisms.reflective.population import (
     ReflectiveSurfels,
     sigmoid,
 )
-from minisplat_ref.mechanisms.reflective.renderer import REFLECTIVE
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
 from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.oracle.gradients import inner_product_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting

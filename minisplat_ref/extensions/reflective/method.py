@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     STAGE,
     WITH_OCCLUSION,
@@ -14,7 +14,7 @@ from minisplat_ref.mechanisms.reflective.population import (
     sigmoid,
     with_materials,
 )
-from minisplat_ref.mechanisms.reflective.renderer import REFLECTIVE
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
 from minisplat_ref.mechanisms.surfels.disagreement import normal_consistency
 from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL

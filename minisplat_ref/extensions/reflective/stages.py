@@ -4,8 +4,8 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.reflective.method import SHADED
-from minisplat_ref.mechanisms.reflective.population import PER_SURFEL, WITH_OCCLUSION
-from minisplat_ref.mechanisms.reflective.stages import shading_stage
+from minisplat_ref.mechanisms.gbuffer.population import PER_SURFEL, WITH_OCCLUSION
+from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage

@@ -19,14 +19,14 @@ from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
 from minisplat_ref.mechanisms.gbuffer.tone import tone
-from minisplat_ref.mechanisms.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     PER_SURFEL,
     STAGE,
     WITH_OCCLUSION,
     ReflectiveSurfels,
 )
-from minisplat_ref.mechanisms.reflective.renderer import REFLECTIVE
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis

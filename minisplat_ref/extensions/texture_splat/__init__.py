@@ -1,7 +1,7 @@
 """Surfels with textures of their normal and material, blended and then shaded.
 
 This follows TextureSplat, Younes and Boukhayma 2025, arXiv 2506.13348. A surfel of Ref-Gaussian
-(:mod:`minisplat_ref.mechanisms.reflective`) has one normal and one material, so that detail takes more surfels. Here
+(:mod:`minisplat_ref.mechanisms.gbuffer.renderer`) has one normal and one material, so that detail takes more surfels. Here
 it has T x T texels over four standard deviations to each side of its disc, which a hit at (u, v) reads linearly:
 
     X(u, v) = sum_ji h(y - j) h(x - i) X_ji,   x = (u / 4 + 1) (T - 1) / 2,   h(t) = max(0, 1 - |t|)

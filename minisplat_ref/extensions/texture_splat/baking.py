@@ -24,7 +24,7 @@ from minisplat_ref.extensions.texture_splat import kernels, reference
 from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, texels_of
 from minisplat_ref.extensions.texture_splat.reference import raw_normals, tangent_normals
 from minisplat_ref.extensions.texture_splat.renderer import disc_axes
-from minisplat_ref.mechanisms.reflective.population import sigmoid
+from minisplat_ref.mechanisms.gbuffer.population import sigmoid
 from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.projection import Surfels
 from minisplat_ref.reference.covariance import rotation_matrices

@@ -5,7 +5,7 @@ from functools import partial
 from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, first_light, with_textures
 from minisplat_ref.extensions.texture_splat.renderer import TEXTURED
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.reflective.population import STAGE
+from minisplat_ref.mechanisms.gbuffer.population import STAGE
 from minisplat_ref.methods.gaussian_splatting import FINE_TUNING
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.reflective.population import PER_PIXEL, STAGE, ReflectiveSurfels, with_materials
-from minisplat_ref.mechanisms.reflective.population import first_light as first_light_of_reflective
+from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, STAGE, ReflectiveSurfels, with_materials
+from minisplat_ref.mechanisms.gbuffer.population import first_light as first_light_of_reflective
 from minisplat_ref.types import Floats, Gaussians, Scene
 
 CHANNELS = {"metallic_logits": 1, "roughness_logits": 1, "albedo_logits": 3, "normal_textures": 2}

@@ -1,7 +1,7 @@
 """How textured surfels are drawn: textures are blended into the channels of normals and materials, then shaded.
 
 Shading, what hides the environment, and the light from around, which has one value for a whole surfel, are those of
-:mod:`minisplat_ref.mechanisms.reflective.renderer`. Textures of one texel are blended as materials are there.
+:mod:`minisplat_ref.mechanisms.gbuffer.renderer`. Textures of one texel are blended as materials are there.
 """
 
 from typing import Any, NamedTuple
@@ -11,8 +11,8 @@ import numpy as np
 from minisplat_ref.extensions.texture_splat import kernels, reference
 from minisplat_ref.extensions.texture_splat.population import texels_of
 from minisplat_ref.extensions.texture_splat.reference import N_CHANNELS, tangent_normals, tangent_normals_vjp
-from minisplat_ref.mechanisms.reflective import renderer as shaded
-from minisplat_ref.mechanisms.reflective.population import PER_PIXEL, STAGE, sigmoid
+from minisplat_ref.mechanisms.gbuffer import renderer as shaded
+from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, STAGE, sigmoid
 from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.renderer import Shown
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
@@ -130,7 +130,7 @@ TEXTURES = shaded.Materials(read_textures, read_textures_vjp, blend, blend_vjp)
 def render(
     model: Model, view: View, request: Request, visibility: Floats | None = None
 ) -> tuple[RenderOutput, shaded.ReflectiveTape]:
-    """Render a view; see :func:`minisplat_ref.mechanisms.reflective.renderer.render`.
+    """Render a view; see :func:`minisplat_ref.mechanisms.gbuffer.renderer.render`.
 
     Textures are shaded pixel by pixel, whatever stage the model has. The channel ``normal`` is that of the textures.
     """

@@ -18,7 +18,7 @@ from minisplat_ref.extensions.texture_splat.baking import Maps, bake
 from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, with_textures
 from minisplat_ref.extensions.texture_splat.renderer import TEXTURED
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.reflective.population import PER_PIXEL, STAGE, ReflectiveSurfels
+from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, STAGE, ReflectiveSurfels
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
 from minisplat_ref.reporting import markdown_table

@@ -22,14 +22,14 @@ from minisplat_ref.mechanisms.gbuffer.shading import Around, ShadingTape, Surfac
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
-from minisplat_ref.mechanisms.reflective.around import (
+from minisplat_ref.mechanisms.gbuffer.around import (
     Sight,
     light_around,
     light_around_vjp,
     sight_of,
     towards_vjp,
 )
-from minisplat_ref.mechanisms.reflective.population import (
+from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     STAGE,
     WITH_OCCLUSION,
