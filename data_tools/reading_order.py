@@ -144,7 +144,12 @@ ORDER = (
                 "discs with depths and normals; from depth maps to a mesh",
             ),
             Step(
-                ("mechanisms/gbuffer/", "extensions/reflective/", "extensions/discretized_sdf/"),
+                (
+                    "mechanisms/gbuffer/",
+                    "extensions/reflective/",
+                    "extensions/texture_splat/",
+                    "extensions/discretized_sdf/",
+                ),
                 (),
                 "materials blended, then shaded per pixel in an environment that is learned; opacity from distances",
             ),

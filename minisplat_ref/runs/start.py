@@ -110,9 +110,9 @@ def _as_population(folder: Path, model: Model, name: str, recipe: Recipe, rng: n
         They are of another kind, ``name``, that has fields which the recipe does not train.
     """
     wanted = recipe.representation
-    if wanted.name == name:
+    if wanted.name == name and name not in wanted.extends:
         return model.gaussians
-    if type(model.gaussians) is Gaussians:
+    if type(model.gaussians) is Gaussians or name in wanted.extends:
         return wanted.extend(model.gaussians, rng)
     further = ", ".join(field for field in model.gaussians._fields if field not in Gaussians._fields)
     raise InputError(

@@ -43,6 +43,8 @@ class Representation(NamedTuple):
     """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
     units: Units = WORLD_UNITS
     """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
+    extends: frozenset[str] = frozenset()
+    """Names of further representations whose populations ``extend`` takes: a training can start from their models."""
 
 
 GAUSSIANS = Representation("gaussians")

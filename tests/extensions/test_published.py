@@ -444,6 +444,25 @@ TABLES = {
         distortion=(0.0, 3_001),
         prune_faint__min_opacity=0.05,
     ),
+    "texture-splat": {
+        **{name: row for name, row in GS.items() if name.startswith(("photometric", "rate", "adam", "per_extent"))},
+        **{name: GS[name] for name in ("iterations", "min_views", "short_run_exponent")},
+        **rows(
+            "TextureSplat, released code: 30,000 more iterations, centres and their number stay, 2 x 2 texels",
+            sh_degree=(3, 0, 0, 0),
+            rate__means=0.0,
+            extend__texels=2,
+        ),
+        **rows(
+            f"{OURS}: those of reflective",
+            rate__normal_textures=0.01,
+            rate__albedo_logits=0.01,
+            rate__metallic_logits=0.01,
+            rate__roughness_logits=0.01,
+            rate__log_environment=0.01,
+            rate__shading_stage=0.0,
+        ),
+    },
     "textured": GS_ACCEL
     | rows(f"{OURS}: between 3DGS's rates", rate__color_textures=0.000625, rate__opacity_textures=0.0125),
     "velocity": GS_ACCEL
@@ -511,6 +530,8 @@ CONSTANTS = [
     ("mechanisms.gbuffer.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
     ("mechanisms.surfels.losses", "NEAR", 0.2, "2DGS, released code"),
     ("mechanisms.surfels.losses", "FAR", 100.0, "2DGS, released code"),
+    ("texture_splat.reference", "REACH", 4.0, "TextureSplat, released code"),
+    ("texture_splat.reference", "TILT_MAX", 0.99, "TextureSplat, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
     ("wave.hologram", "PITCH", 8.0, f"{OURS}: um, of displays of phases that can be bought"),
     ("wave.hologram", "WAVELENGTHS", (638.0, 520.0, 450.0), f"{OURS}: nm, of laser diodes"),

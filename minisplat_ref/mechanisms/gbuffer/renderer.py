@@ -9,8 +9,9 @@ with the accumulated opacity A. With occlusion, ``1 - V`` is the opacity of the 
 the expected depth of the pixel on (:mod:`minisplat_ref.mechanisms.gbuffer.visibility`).
 """
 
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +49,32 @@ RAY_START = 0.02  # of the pixel's depth: where a reflected ray begins, so that 
 GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
 
 
+class MaterialGradient(NamedTuple):
+    """Gradient of the loss with respect to what materials are made of."""
+
+    fields: Mapping[str, Floats]
+    """By the fields of the population that only materials are made of."""
+    quats: Floats | float = 0.0
+    """[N, 4]; 0 where no material has a direction."""
+    cam_from_world_R: Floats | float = 0.0
+    """[3, 3]."""
+
+
+class Materials(NamedTuple):
+    """How surfels have their materials: one for a whole surfel, as :data:`FLAT`, or another one at each of its points.
+
+    The functions of blending are those of :mod:`minisplat_ref.mechanisms.surfels.renderer`, or take ``carried`` in
+    another form; a tape has ``shown``, and normals and materials are in the same channels.
+    """
+
+    carried: Callable[[discs.Seen], Any]
+    """What the surfels of a view bring along."""
+    carried_vjp: Callable[[discs.Seen, Any], MaterialGradient]
+    """Gradient of ``carried``."""
+    blend: Callable[..., tuple[RenderOutput, Any]] = discs.blend
+    blend_vjp: Callable[..., discs.BlendedGradient] = discs.blend_vjp
+
+
 class _Pixels(NamedTuple):
     """The pixels that show a surfel, and what was blended there."""
 
@@ -64,7 +91,7 @@ class ReflectiveTape(NamedTuple):
     model: Model
     seen: discs.Seen
     request: Request
-    blend: discs.BlendTape
+    blend: Any  # tape of the materials' ``blend``
     rows: Ints  # [M] visible surfels
     sight: Sight
     degree: int
@@ -73,6 +100,7 @@ class ReflectiveTape(NamedTuple):
     environment: Floats  # [H, 2 H, 3]
     pixels: _Pixels | None  # of shading per pixel
     slices: dict[str, slice]  # of what is blended
+    materials: Materials
 
 
 def channels(wants: frozenset[str]) -> dict[str, slice]:
@@ -86,13 +114,29 @@ def channels(wants: frozenset[str]) -> dict[str, slice]:
     return slices
 
 
-def materials(g: ReflectiveSurfels) -> Floats:
+def flat_materials(g: ReflectiveSurfels) -> Floats:
     """Return albedo, metallic share and roughness of all surfels, [N, 5]."""
     return np.column_stack([sigmoid(g.albedo_logits), sigmoid(g.metallic_logits), sigmoid(g.roughness_logits)])
 
 
+def _flat_materials_vjp(seen: discs.Seen, v_materials: Floats) -> MaterialGradient:
+    """Gradient of :func:`flat_materials`: ``v_logit = s (1 - s) v_s``."""
+    shares = flat_materials(seen.gaussians)
+    v = shares * (1 - shares) * v_materials
+    return MaterialGradient({"albedo_logits": v[:, :3], "metallic_logits": v[:, 3], "roughness_logits": v[:, 4]})
+
+
+FLAT = Materials(lambda seen: flat_materials(seen.gaussians), _flat_materials_vjp)
+
+
 def render(
-    model: Model, view: View, request: Request, visibility: Floats | None = None, *, mirrors: bool
+    model: Model,
+    view: View,
+    request: Request,
+    visibility: Floats | None = None,
+    *,
+    mirrors: bool,
+    materials: Materials = FLAT,
 ) -> tuple[RenderOutput, ReflectiveTape]:
     """Render a view of reflective surfels; see :func:`minisplat_ref.mechanisms.surfels.renderer.render`.
 
@@ -106,6 +150,8 @@ def render(
         How much of the environment each pixel's reflected ray sees; traced by default.
     mirrors : bool
         Whether surfels reflect light besides scattering it.
+    materials : Materials
+        How surfels have their materials. Shading surfel by surfel takes ``FLAT`` alone.
 
     Raises
     ------
@@ -124,7 +170,7 @@ def render(
     sight = sight_of(g.means[rows], seen.surfels.normals[rows].astype(dtype), pose(camera, dtype))
     degree = int(np.max(choose_degree(g.sh_rest, request.sh_degree), initial=0))
     environment = np.exp(model.shared[ENVIRONMENT].astype(dtype))
-    light, carried, colors = prefilter(environment), materials(g), np.zeros_like(g.means)
+    light, carried, colors = prefilter(environment), materials.carried(seen), np.zeros_like(g.means)
     slices = discs.channels(own.wants)
     if stage < PER_PIXEL:
         surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
@@ -134,7 +180,7 @@ def render(
         image, pixels = output.image, None
     else:
         colors[rows] = light_around(sight, coefficients(g, rows), degree)
-        output, tape = discs.blend(seen, colors, carried, own._replace(background=None))
+        output, tape = materials.blend(seen, colors, carried, own._replace(background=None))
         pixels = _pixels(output, slices, camera, request)
         n_world = pixels.blended[:, 3:6] / pixels.lengths @ sight.R
         X = pixels.blended / pixels.alpha[:, None]
@@ -159,7 +205,7 @@ def render(
             wanted.append(image[:, :, first + at : first + at + size])
     output = output._replace(image=np.ascontiguousarray(np.concatenate(wanted, axis=2)))
     return output, ReflectiveTape(
-        model, seen, request, tape, rows, sight, degree, shading, linear, environment, pixels, slices
+        model, seen, request, tape, rows, sight, degree, shading, linear, environment, pixels, slices, materials
     )
 
 
@@ -199,17 +245,16 @@ def render_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats | None = N
         flat[p.rows, :3] = v_X[:, :3]
         flat[p.rows, tape.slices["normal"]] += v_X[:, 3:6]
         flat[p.rows, first:] += v_X[:, 6:]
-    v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
-    v_carried = np.zeros((len(g.means), 5), dtype)
-    v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
+    v_blend = tape.materials.blend_vjp(tape.blend, v_sums, v_alpha)
     v_coefficients = np.zeros((len(tape.rows), 1 + g.sh_rest.shape[1], 3), dtype)
     if tape.pixels is not None:
-        v_light = v_blend.colors[tape.rows]
+        v_carried, v_light = v_blend.carried, v_blend.colors[tape.rows]
         v_around = light_around_vjp(tape.sight, coefficients(g, tape.rows), tape.degree, v_light)
         v_coefficients, v_x, v_normals = v_around.coefficients, v_around.x, v_around.normals
         v_R = v_R + v_around.R
     else:
-        v_background = v_blend.background
+        v_background, v_carried = v_blend.background, np.zeros((len(g.means), 5), dtype)
+        v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
         v = shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
         v_carried[tape.rows, :3] += v.surface.albedo
         v_carried[tape.rows, 3] += v.surface.metallic
@@ -240,15 +285,14 @@ def _of_parameters(
     v_means[rows], v_sh_dc[rows], v_sh_rest[rows] = v_x @ tape.sight.R, v_coefficients[:, 0], v_coefficients[:, 1:]
     v_R = v_R + v_x.T @ g.means[rows]
     zero = np.zeros((3, 3), g.means.dtype)
+    v_materials = tape.materials.carried_vjp(tape.seen, v_carried)
+    v_primitives = v_primitives._replace(quats=v_primitives.quats + v_materials.quats)
+    v_R = v_R + v_materials.cam_from_world_R
     of_six = parameters_vjp(
         g, tape.seen.primitives, v_primitives, SHGradient(v_means, v_sh_dc, v_sh_rest, zero, zero[0])
     )
-    shares = materials(g)
-    v_logits = shares * (1 - shares) * v_carried
     return RenderGradient(
-        gaussians=of_six._replace(
-            albedo_logits=v_logits[:, :3], metallic_logits=v_logits[:, 3], roughness_logits=v_logits[:, 4]
-        ),
+        gaussians=of_six._replace(**v_materials.fields),
         background=zero[0],
         cam_from_world_R=(v_primitives.cam_from_world_R + v_R).astype(g.means.dtype),
         cam_from_world_t=(v_primitives.cam_from_world_t + v_x.sum(axis=0)).astype(g.means.dtype),

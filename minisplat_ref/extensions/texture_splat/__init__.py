@@ -1,0 +1,48 @@
+"""Surfels with textures of their normal and material, blended and then shaded.
+
+This follows TextureSplat, Younes and Boukhayma 2025, arXiv 2506.13348. A surfel of Ref-Gaussian
+(:mod:`minisplat_ref.mechanisms.gbuffer.renderer`) has one normal and one material, so that detail takes more surfels.
+Here it has T x T texels over four standard deviations to each side of its disc, which a hit at (u, v) reads linearly:
+
+    X(u, v) = sum_ji h(y - j) h(x - i) X_ji,   x = (u / 4 + 1) (T - 1) / 2,   h(t) = max(0, 1 - |t|)
+
+X is a normal, from two numbers whose tanh is its tilt along the axes of the disc, with albedo, metallic share and
+roughness (:mod:`.reference`). What hits read is blended, and each pixel is shaded once, as in Ref-Gaussian. With T = 1
+this is Ref-Gaussian. Textures start as what each surfel of a finished run is everywhere; then centres and their number
+stay, and everything else is trained. With maps of normals and materials as targets, texels are also the solution of a
+linear least-squares problem (:mod:`.baking`).
+
+    minisplat-ref train SCENE --recipe reflective --out runs/reflective
+    minisplat-ref train SCENE --recipe texture-splat --init runs/reflective --set texels=4 --out runs/textured
+    minisplat-ref render runs/textured --map normal
+    minisplat-ref study texture-splat/bricks --out DIR
+    minisplat-ref oracle gradients --extension texture-splat
+
+``docs/FAMILY.md`` has the measured figures.
+
+This deviates from the paper as follows. Texels hold normals and materials after their tanh and sigmoid, and are then
+interpolated, which makes the blend linear in them. A disc seen from behind shows the relief of its front from below.
+Learning rates are ours, and shapes and opacities are trained at those of 3DGS. The light from around has no texture.
+"""
+
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.texture_splat.file import load
+from minisplat_ref.extensions.texture_splat.method import RECIPE, TEXTURED_SURFELS
+from minisplat_ref.extensions.texture_splat.stages import stages
+from minisplat_ref.studies.study import OUT, declare, seeds
+
+BRICKS = declare(
+    "bricks",
+    "a brick wall: more texels beside more surfels, with as many floats",
+    f"{__name__}.study.run",
+    *(OUT, seeds(3)),
+)
+EXTENSION = Extension(
+    "texture-splat",
+    recipes=(RECIPE,),
+    representation=TEXTURED_SURFELS,
+    load=load,
+    stages=stages,
+    studies=(BRICKS,),
+)
+"""Surfels with textures, the recipe that trains them after others, and a study."""
