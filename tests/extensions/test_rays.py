@@ -400,7 +400,7 @@ def test_the_degenerate_case_is_one_gaussian_on_the_axis(rng):
 def test_the_speed_is_told_with_its_error(capsys):
     assert main(["study", "rays/speed", "--gaussians", "200", "--repeats", "1"]) == 0
     out = capsys.readouterr().out
-    assert "A ray takes " in out and float(re.search(r"error of float32 +\| +(\S+)", out)[1]) < PARITY_FLOAT32_IMAGE
+    assert " a ray takes " in out and float(re.search(r"error of float32 +\| +(\S+)", out)[1]) < PARITY_FLOAT32_IMAGE
     with pytest.raises(SystemExit, match="2"):
         main(["study", "rays/speed", "--repeats", "0"])
 

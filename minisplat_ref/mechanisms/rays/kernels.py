@@ -70,6 +70,8 @@ class KeptHits(NamedTuple):
 
     starts: Ints
     """[P]."""
+    n_hits: Ints
+    """[P]."""
     rows: Ints
     """[room] int32 of the tree."""
     unclamped: Floats
@@ -78,6 +80,8 @@ class KeptHits(NamedTuple):
     """[room] t."""
     weights: Floats
     """[room] ``w = alpha T``."""
+    n_used: Ints
+    """[1] the room that all hits need; if there was less, some are missing."""
 
 
 class _HitGradient(NamedTuple):
@@ -105,20 +109,21 @@ def _kernels_of(response: RayResponse) -> _Kernels:
     n_sums = 7 + n_shape
 
     @kernel()
-    def blend(tree, colors, rays, background, limits, n_threads, blended, kept, used):
+    def blend(tree, shades, rays, limits, n_threads, blended, kept):
         n_rays = len(rays.near)
         taken = make_shared_counter()
+        colors, background = shades
         for _ in prange(n_threads):
             found = empty_lists(limits.capacity)
-            image, depths, transmittances, n_hits, is_seen = blended
-            starts, kept_rows, kept_unclamped, kept_depths, kept_weights = kept
+            image, depths, transmittances, is_seen = blended
+            starts, n_hits, kept_rows, kept_unclamped, kept_depths, kept_weights, n_used = kept
             for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
                 for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                     lane = r % WIDTH
                     if lane == 0:
                         find_hits(tree, rays, r, n_rays, limits, found)
                     n = found.counts[lane]
-                    start = fetch_and_add(used, n)
+                    start = fetch_and_add(n_used, n)
                     is_kept = start + n <= len(kept_rows)
                     T, red, green, blue, depth, count = 1.0, 0.0, 0.0, 0.0, 0.0, 0
                     while count < n:
@@ -145,7 +150,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                     depths[r], transmittances[r], n_hits[r], starts[r] = depth, T, count, start
 
     @kernel()
-    def differentiate_rays(tree, colors, rays, limits, n_threads, kept, n_hits, cotangents, v):
+    def differentiate_rays(tree, colors, rays, limits, n_threads, kept, cotangents, v):
         """Write the gradient with respect to each hit and each ray, from the last hit to the first."""
         n_rays = len(rays.near)
         taken = make_shared_counter()
@@ -157,7 +162,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                     red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
                     for k in range(6):
                         v_rays[r, k] = 0.0
-                    for h in range(kept.starts[r] + n_hits[r] - 1, kept.starts[r] - 1, -1):
+                    for h in range(kept.starts[r] + kept.n_hits[r] - 1, kept.starts[r] - 1, -1):
                         row = kept.rows[h]
                         g, weight, unclamped = tree.gaussian_ids[row], kept.weights[h], kept.unclamped[h]
                         alpha = min(limits.alpha_max, unclamped)
@@ -201,17 +206,17 @@ def _kernels_of(response: RayResponse) -> _Kernels:
 
 
 @kernel(parallel=False)
-def _sort_by_row(kept, n_hits, groups):
+def _sort_by_row(kept, groups):
     """Write which hits each row of the tree has, in the order of the rays; ``groups.offsets`` are zeros."""
     offsets, hits, rays = groups
-    for r in range(len(n_hits)):
-        for h in range(kept.starts[r], kept.starts[r] + n_hits[r]):
+    for r in range(len(kept.n_hits)):
+        for h in range(kept.starts[r], kept.starts[r] + kept.n_hits[r]):
             offsets[kept.rows[h] + 1] += 1
     for row in range(len(offsets) - 1):
         offsets[row + 1] += offsets[row]
     place = offsets[:-1].copy()
-    for r in range(len(n_hits)):
-        for h in range(kept.starts[r], kept.starts[r] + n_hits[r]):
+    for r in range(len(kept.n_hits)):
+        for h in range(kept.starts[r], kept.starts[r] + kept.n_hits[r]):
             i = place[kept.rows[h]]
             hits[i], rays[i] = h, r
             place[kept.rows[h]] = i + 1
@@ -261,13 +266,13 @@ def blend_rays_vjp(
     """Gradient of :func:`blend_rays`: see :func:`minisplat_ref.mechanisms.rays.blending.blend_rays_vjp`."""
     v_image, v_depths, v_transmittances = (_wide(v) for v in v_blended)
     kernels, kept = _kernels_of(response), _kept_of(response, tree, rays, conventions, blended)
-    n_hits, n_rays, n_rows, room = blended.n_hits, len(rays.near), len(tree.gaussian_ids), len(kept.rows)
+    n_rays, n_rows, room = len(rays.near), len(tree.gaussian_ids), len(kept.rows)
     behind = blended.transmittances * (v_image @ _wide(background) + v_transmittances)
     v = _HitGradient(np.empty(room), np.empty(room), np.empty((n_rays, 6)))
     cotangents, limits = _RayCotangents(v_image, v_depths, behind), limits_of(conventions, n_rows)
-    kernels.differentiate_rays(tree, _wide(colors), rays, limits, n_threads(), kept, n_hits, cotangents, v)
-    groups = _HitsOfRows(np.zeros(n_rows + 1, np.int64), *np.empty((2, int(n_hits.sum())), np.int64))
-    _sort_by_row(kept, n_hits, groups)
+    kernels.differentiate_rays(tree, _wide(colors), rays, limits, n_threads(), kept, cotangents, v)
+    groups = _HitsOfRows(np.zeros(n_rows + 1, np.int64), *np.empty((2, int(kept.n_hits.sum())), np.int64))
+    _sort_by_row(kept, groups)
     sums, v_gaussians = np.empty((n_rows, 7 + response.n_shape)), np.zeros((tree.n, 7))
     kernels.add_up(tree, rays, n_threads(), kept, groups, v_image, v, sums)
     np.add.at(v_gaussians, tree.gaussian_ids, sums[:, :7])
@@ -291,13 +296,15 @@ def _blend(
     room: int,
 ) -> tuple[BlendedRays, int]:
     """Return what the rays see, with their hits if these fit into ``room``, and the room that they need."""
-    n, (colors, background) = len(rays.near), (_wide(shade) for shade in shades)
-    blended = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, np.int64), np.zeros(tree.n, bool)
-    kept = KeptHits(np.empty(n, np.int64), np.empty(room, np.int32), *(np.empty(room) for _ in range(3)))
-    limits, used = limits_of(conventions, len(tree.gaussian_ids)), np.zeros(1, np.int64)
-    _kernels_of(response).blend(tree, colors, rays, background, limits, n_threads(), blended, kept, used)
-    n_used = int(used[0])
-    return BlendedRays(*blended, kept if n_used <= room else None), n_used
+    n, n_hits = len(rays.near), np.empty(len(rays.near), np.int64)
+    image, depths, transmittances, is_seen = np.empty((n, 3)), np.empty(n), np.empty(n), np.zeros(tree.n, bool)
+    starts, rows, n_used = np.empty(n, np.int64), np.empty(room, np.int32), np.zeros(1, np.int64)
+    kept = KeptHits(starts, n_hits, rows, np.empty(room), np.empty(room), np.empty(room), n_used)
+    limits, wide = limits_of(conventions, len(tree.gaussian_ids)), (_wide(shades[0]), _wide(shades[1]))
+    arrays = image, depths, transmittances, is_seen
+    _kernels_of(response).blend(tree, wide, rays, limits, n_threads(), arrays, kept)
+    is_complete, needed = n_used[0] <= room, int(n_used[0])
+    return BlendedRays(image, depths, transmittances, n_hits, is_seen, kept if is_complete else None), needed
 
 
 def _kept_of(
