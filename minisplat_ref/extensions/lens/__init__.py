@@ -1,4 +1,4 @@
-"""Lens: photographs as they were taken, through distorting lenses and fisheyes, without undistortion.
+"""Lens: photographs as they were taken, through distorting lenses and fisheyes.
 
 3DGS draws through a pinhole, so photographs of other lenses are warped first, which crops their borders, and of a wide
 fisheye most of the image. This extension follows 3DGUT (Wu et al. 2025, arXiv 2412.12507) and draws what the lens has
@@ -21,11 +21,21 @@ pixel may be missed by all rays.
 
     minisplat-ref train SCENE --recipe lens
     minisplat-ref train SCENE --extension lens --recipe 3dgs
+    minisplat-ref study lens/footprints --out DIR
     minisplat-ref oracle gradients --extension lens
 """
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
 from minisplat_ref.extensions.lens.stages import stages
+from minisplat_ref.studies.study import OUT, declare, number, seed
 
-EXTENSION = Extension("lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages)
+FOOTPRINTS = declare(
+    "footprints",
+    "EWA, UT and exact footprints off the axis of a lens",
+    f"{__name__}.footprints.run",
+    OUT,
+    number("--gaussians", 20, "number of Gaussians"),
+    seed("of the Gaussians"),
+)
+EXTENSION = Extension("lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages, studies=(FOOTPRINTS,))
