@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gradcheck import check_inner_products
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.lens.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
 from minisplat_ref.extensions.lens.reference import RESPONSE, hit, project
 from minisplat_ref.extensions.lens.stages import OPTICS, stages
@@ -150,6 +152,14 @@ def test_other_renderers_refuse_the_camera_and_this_one_what_it_does_not_give():
         draw(balls([[0, 0, 2]], [0.1], [0.5]), camera, CPU, frozenset({"surface"}))
 
 
+def test_the_study_of_footprints(tmp_path):
+    """On a small set: EWA and the unscented conic err more off the axis, and the exact response hardly."""
+    assert main(["study", "lens/footprints", "--gaussians", "2", "--out", str(tmp_path)]) == 0
+    for errors in json.loads((tmp_path / "result.json").read_text())["errors"].values():
+        assert errors["EWA"][-1] > errors["EWA"][0] > errors["UT"][0] > 0.02
+        assert max(errors["exact"]) < 0.05  # what the bounds leave out
+
+
 # --- from photographs to a rendering ---
 
 
@@ -204,3 +214,90 @@ def test_lenses_that_cannot_be_drawn_are_refused_in_a_line(tmp_path, capsys, mod
 
 def test_the_response_lists_what_it_differentiates():
     assert RESPONSE.fields == ("positions", "whitenings", "opacities")
+
+
+# --- gsplat's call ---
+
+
+def call_of(rng, camera):
+    means, quats, scales, opacities = activate(make_gaussians(rng, 8, sh_degree=0))
+    M = np.eye(4)
+    M[:3, :3], M[:3, 3] = camera.cam_from_world_R, camera.cam_from_world_t
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    views = {"viewmats": M[None], "Ks": K[None], "width": camera.width, "height": camera.height}
+    primitives = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    return {**primitives, "colors": rng.uniform(size=(8, 3)), "backgrounds": rng.uniform(size=(1, 3)), **views}
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {
+            "radial_coeffs": np.array([[-0.2, 0.05, 0.01, 0.0, 0.01, 0.0]]),
+            "tangential_coeffs": np.array([[0.01, -0.02]]),
+        },
+        {"camera_model": "fisheye", "radial_coeffs": np.array([[0.05, -0.02, 0.01, 0.0]])},
+    ],
+    ids=["brown", "fisheye"],
+)
+def test_gsplats_call_has_the_gradient_of_its_images(lens, backend):
+    rng = np.random.default_rng(8)
+    call = {**call_of(rng, make_camera(rng=rng)), **lens, "backend": backend}
+    image, alpha = rasterization(**call)
+    v_image, v_alpha = rng.normal(size=image.shape), rng.normal(size=alpha.shape)
+    v = rasterization_vjp(**call, v_render_colors=v_image, v_render_alphas=v_alpha)
+    names = ["means", "quats", "scales", "opacities", "colors", "backgrounds", "viewmats"]
+
+    def function(*arrays):
+        return rasterization(**{**call, **dict(zip(names, arrays, strict=True))})
+
+    inputs, gradient = [call[name] for name in names], [v[f"v_{name}"] for name in names]
+    keep = names.index("viewmats")  # its last row is no variable; a rotation must stay one to the checks
+    check_inner_products(
+        lambda *moved: function(*moved, inputs[keep]),
+        gradient[:keep],
+        inputs[:keep],
+        (v_image, v_alpha),
+        rng,
+        names=names[:keep],
+        step=1e-8,
+    )
+    assert np.abs(v["v_viewmats"]).max() > 0
+
+
+@pytest.mark.parametrize("model", ["ortho", "fisheye"])
+def test_other_cameras_project_as_gsplats_own_statement(model):
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("gsplat")
+    from gsplat.cuda._torch_impl import _fisheye_proj, _ortho_proj
+
+    camera = make_camera()
+    x = np.random.default_rng(0).normal(size=(9, 3)) * [0.4, 0.4, 0.3] + [0, 0, 3]
+    C = covariances(np.random.default_rng(1).normal(size=(9, 4)), np.full((9, 3), 0.1) * [1, 2, 3])
+    K = torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]])
+    theirs = {"ortho": _ortho_proj, "fisheye": _fisheye_proj}[model](
+        torch.tensor(x)[None], torch.tensor(C)[None], K, camera.width, camera.height
+    )
+    optics = Optics("orthographic") if model == "ortho" else Optics("fisheye", (0.0,) * 4)
+    bent = camera._replace(optics=optics)
+    functions = model_of(bent)
+    J = functions.jacobians(x, bent)
+    # gsplat adds 1e-7 to lengths, which moves a fisheye's pixels by about as much.
+    assert_allclose(functions.project(x, bent), theirs[0][0].numpy(), atol=1e-5)
+    assert_allclose(J @ C @ np.swapaxes(J, 1, 2), theirs[1][0].numpy(), rtol=1e-4, atol=1e-5)
+
+
+def test_gsplats_call_refuses_what_it_cannot_draw():
+    call = call_of(np.random.default_rng(0), make_camera())
+    image, _ = rasterization(**call, camera_model="ortho")
+    assert image.shape == (1, 18, 24, 3)
+    for wrong, message in (
+        ({"camera_model": "lidar"}, "has no exact rays here"),
+        ({"radial_coeffs": np.zeros((1, 4))}, "radial_coeffs must be 1 x 6 finite numbers"),
+        ({"camera_model": "ortho", "radial_coeffs": np.zeros((1, 6))}, "has no distortion"),
+        ({"camera_model": "fisheye", "tangential_coeffs": np.zeros((1, 2))}, "has no tangential_coeffs"),
+        ({"sh_degree": 3}, "sh_degree is not computed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            rasterization(**{**call, **wrong})

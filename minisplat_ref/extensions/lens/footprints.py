@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.lens.reference import hit, project
-from minisplat_ref.mechanisms.cameras.models import model_of
+from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
 from minisplat_ref.mechanisms.cameras.unscented import unscented
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reports.palette import BLUE, GREY, RED
@@ -50,7 +50,7 @@ def errors_at(ahead: Primitives, angle: float, kind: str) -> dict[str, float]:
     x = ahead.means @ R.T
     grid = np.arange(SIZE) + 0.5
     pixels = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    _, rays = model.rays(pixels, camera)
+    rays = np.moveaxis(ray_table(camera).reshape(SIZE, 3, -1)[:, :, :SIZE], 1, 2).reshape(-1, 3)
     P = np.linalg.inv(axes @ np.swapaxes(axes, 1, 2))
     J = model.jacobians(x, camera)
     conics = {

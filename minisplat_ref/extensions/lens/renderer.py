@@ -45,10 +45,7 @@ class Prepared(NamedTuple):
 
     def listed(self) -> TileBins:
         """Return the tiles' lists, nearest means first."""
-        grid = TileGrid(self.camera.width, self.camera.height, self.backend.tile_width, self.backend.tile_height)
-        f, zeros = self.footprints, np.zeros((len(self.channels), 3))
-        ordered = Projection(f.means2d, f.depths, zeros, f.opacities, f.radii, f.boxes)
-        return REFERENCE.bin_gaussians(ordered, grid, self.conventions)
+        return list_tiles(self.footprints, self.camera, self.backend, self.conventions)
 
 
 class Tape(NamedTuple):
@@ -57,6 +54,13 @@ class Tape(NamedTuple):
     prepared: Prepared
     bins: TileBins
     output: RenderOutput
+
+
+def list_tiles(f: LensFootprints, camera: Camera, backend: Backend, conventions: Conventions) -> TileBins:
+    """Return the Gaussians of each of the backend's tiles, nearest means first."""
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    ordered = Projection(f.means2d, f.depths, np.zeros((len(f.depths), 3)), f.opacities, f.radii, f.boxes)
+    return REFERENCE.bin_gaussians(ordered, grid, conventions)
 
 
 def prepare(model: Model, camera: Camera, request: Request) -> Prepared:
