@@ -235,7 +235,7 @@ def check_photo(photo: Photo, source: Path, takes_lens: bool) -> None:
         raise InputError(
             f"{source}: {photo.file} has lens distortion (camera model {photo.lens.model}), only pinholes are rendered;"
             f" run `minisplat-ref undistort {source} --out DIR`, or train with --undistort (undistort=True in Python),"
-            " or as photographed with --extension lens"
+            " or as photographed with --recipe lens"
         )
     if photo.lens is not None and not np.isfinite(photo.lens.params).all():
         raise InputError(

@@ -146,7 +146,7 @@ def test_a_shift_by_a_pixel_is_what_means2d_says():
 
 def test_other_renderers_refuse_the_camera_and_this_one_what_it_does_not_give():
     camera = make_camera()._replace(optics=BARE)
-    with pytest.raises(InputError, match="draws pinholes, not brown cameras: use extension lens"):
+    with pytest.raises(InputError, match="draws pinholes, not brown cameras: train with --recipe lens"):
         SPLATTING.render(Model(balls([[0, 0, 2]], [0.1], [0.5])), view_from(camera), Request())
     with pytest.raises(InputError, match="lens does not give surface"):
         draw(balls([[0, 0, 2]], [0.1], [0.5]), camera, CPU, frozenset({"surface"}))
@@ -171,7 +171,7 @@ def test_scenes_are_read_as_photographed(tmp_path):
     assert camera.optics == Optics("brown", (0.1, -0.05, 0.0, 0.0, 0.0, 0.0, 0.004, -0.003))
     with pytest.raises(InputError, match="leave out one of the two"):
         load_scene(folder, as_photographed=True, undistort=True)
-    with pytest.raises(InputError, match="as photographed with --extension lens"):
+    with pytest.raises(InputError, match="as photographed with --recipe lens"):
         load_scene(folder)
 
 
@@ -197,6 +197,12 @@ def test_train_and_render_as_photographed(tmp_path):
     assert cameras[0]["optics"][:3] == ["brown", 0.1, -0.05] and cameras[0]["width"] == 32
     assert main(["render", str(run), "--cameras", "test", "--out", str(tmp_path / "views")]) == 0
     assert len(list((tmp_path / "views").glob("*.png"))) == 2
+
+
+def test_recipes_that_need_pinholes_say_so_in_a_line(tmp_path, capsys):
+    folder = write_colmap(tmp_path / "scene", n=9, model="OPENCV", params=DISTORTED)
+    code = main(["train", str(folder), "--extension", "lens", "--minutes", "1", "--out", str(tmp_path / "out")])
+    assert_refused(capsys, tmp_path, code, "a brown camera is no pinhole, which this step needs")
 
 
 @pytest.mark.parametrize(

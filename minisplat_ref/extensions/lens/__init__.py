@@ -16,7 +16,8 @@ are read as photographed. Where a lens has no distortion, images are those of th
 
 This deviates from 3DGUT as follows: a Gaussian of which a sigma point is not seen gets the whole image as its bounds,
 and a ray meets only what lies in front of it. Left out are rolling shutter, thin prisms, secondary rays, the exact
-order of each pixel, and derivatives with respect to the lens. There is no low-pass, so a Gaussian much thinner than a
+order of each pixel, derivatives with respect to the lens, and recipes that search surfaces (``adaptive``, the
+``mini-splatting`` family), which refuse such cameras. There is no low-pass, so a Gaussian much thinner than a
 pixel may be missed by all rays.
 
     minisplat-ref train SCENE --recipe lens
