@@ -143,6 +143,21 @@ def test_where_lenses_fold():
     check_optics(camera._replace(fx=80.0, fy=80.0))
 
 
+def test_at_its_limit_a_fisheye_of_all_coefficients_stops_growing():
+    k = (0.05, -0.02, -0.01, -0.003)
+    limit = fisheye_limit(k)
+    camera = make_camera(200, 200, fx=50.0, fy=50.0)._replace(optics=Optics("fisheye", k))
+    angles = limit + np.array([-1e-3, 0.0, 1e-3])
+    radii = MODELS["fisheye"].project(np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)]), camera)[:, 0]
+    assert limit < 3 and radii[1] > max(radii[0], radii[2])
+
+
+def test_distances_have_the_gradient_along_the_ray():
+    x, v = np.array([[1.0, -2.0, 2.0]]), np.array([6.0])
+    assert_allclose(MODELS["fisheye"].depths_vjp(x, v), [[2.0, -4.0, 4.0]])
+    assert_allclose(PERSPECTIVE.depths_vjp(x, v), [[0.0, 0.0, 6.0]])
+
+
 def test_unknown_optics_are_refused():
     with pytest.raises(InputError, match="'sphere' are not known: choose from brown"):
         model_of(make_camera()._replace(optics=Optics("sphere")))
