@@ -103,6 +103,8 @@ def render(
     tape : RenderTape
         For :func:`render_vjp`.
     """
+    if camera.optics is not None:
+        raise InputError(f"this renderer draws pinholes, not {camera.optics.model} cameras: train with --recipe lens")
     dtype = gaussians.means.dtype
     stored_degree = math.isqrt(gaussians.sh_rest.shape[1] + 1) - 1
     sh_degree = stored_degree if sh_degree is None else sh_degree

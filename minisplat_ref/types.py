@@ -66,8 +66,17 @@ class Model(NamedTuple):
     """Arrays without rows, by name: an exposure or a pose for each photograph, the weights of a network."""
 
 
+class Optics(NamedTuple):
+    """How a camera that is no pinhole bends directions; :mod:`minisplat_ref.mechanisms.cameras` has the functions."""
+
+    model: str
+    """``brown``, ``fisheye`` or ``orthographic``."""
+    coefficients: tuple[float, ...] = ()
+    """Without unit: k1 to k6, p1, p2 of ``brown``; k1 to k4 of ``fisheye``."""
+
+
 class Camera(NamedTuple):
-    """A pinhole camera: x_cam = R x_world + t; u = fx x/z + cx; v = fy y/z + cy."""
+    """A pinhole camera: x_cam = R x_world + t; u = fx x/z + cx; v = fy y/z + cy. With ``optics``, another one."""
 
     cam_from_world_R: Floats
     """[3, 3] rotation."""
@@ -85,6 +94,8 @@ class Camera(NamedTuple):
     """Image width, pixels."""
     height: int
     """Image height, pixels."""
+    optics: Optics | None = None
+    """None of a pinhole. Others are drawn by renderers that say so (``Representation.takes_optics``)."""
 
     @property
     def center(self) -> Floats:

@@ -30,6 +30,7 @@ def load_scene(
     test_every: int = 8,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
+    as_photographed: bool = False,
     model: str | None = None,
 ) -> Scene:
     """Load a scene of photographs with cameras, whichever way it is described.
@@ -38,7 +39,7 @@ def load_scene(
     ----------
     path : str or Path
         Folder of a COLMAP scene or of a transforms.json (COLMAP wins where both are there), or a transforms.json file.
-    downscale, test_every, background, undistort
+    downscale, test_every, background, undistort, as_photographed
         See :func:`load_colmap` and :func:`load_transforms`.
     model : str, optional
         Folder of a COLMAP model, relative to ``path``, where there are several.
@@ -56,7 +57,7 @@ def load_scene(
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
     options: dict[str, Any] = {"downscale": downscale, "test_every": test_every, "background": background}
-    options["undistort"] = undistort
+    options |= {"undistort": undistort, "as_photographed": as_photographed}
     if find_model(path, model) is not None:
         return load_colmap(path, model=model, **options)
     if find_transforms(path):

@@ -58,6 +58,7 @@ def load_colmap(
     test_every: int = 8,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
+    as_photographed: bool = False,
     model: str | None = None,
 ) -> Scene:
     """Load a COLMAP scene.
@@ -75,6 +76,8 @@ def load_colmap(
         Colour behind everything, in [0, 1]; black by default.
     undistort : bool
         Warp images of other camera models to a pinhole, instead of refusing them.
+    as_photographed : bool
+        Leave them as they are, with cameras that have ``optics``.
     model : str, optional
         Folder of the model, relative to ``path``, where there are several; the first of those above by default.
 
@@ -88,7 +91,7 @@ def load_colmap(
         If a file is missing or damaged, a camera model is distorted, or an image does not fit its camera.
     """
     path = Path(path)
-    reading = build_reading(downscale, background, undistort, alpha_is_mask=True)
+    reading = build_reading(downscale, background, undistort, True, as_photographed)
     reconstruction = read_model(path, model)
     train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every)
     points, colors = _points(reconstruction)

@@ -1,8 +1,11 @@
-"""Lens distortion: the renderer has only pinhole cameras, so pycolmap warps other photographs to a pinhole.
+"""Lens distortion: most renderers have only pinhole cameras, so pycolmap warps other photographs to a pinhole.
 
-COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels.
+COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels. For renderers that draw
+what the lens has drawn, :func:`optics_of` says what it does in the terms of :class:`minisplat_ref.types.Optics`.
 """
 
+from collections.abc import Mapping
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -11,7 +14,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import MASK_THRESHOLD
-from minisplat_ref.types import Bools, Camera
+from minisplat_ref.types import Bools, Camera, Optics
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -25,6 +28,41 @@ class Lens(NamedTuple):
     """Name of a COLMAP camera model."""
     params: tuple[float, ...]
     """Its parameters in COLMAP's order, pixels."""
+
+
+BROWN, FISHEYE = "brown", "fisheye"
+# Of each model the name of its optics, and where its parameters behind the focal lengths and the principal point go:
+# k1 to k6, p1, p2, or k1 to k4.
+COEFFICIENTS: Mapping[str, tuple[str, int, tuple[int, ...]]] = {
+    "SIMPLE_RADIAL": (BROWN, 3, (0,)),
+    "RADIAL": (BROWN, 3, (0, 1)),
+    "OPENCV": (BROWN, 4, (0, 1, 6, 7)),
+    "FULL_OPENCV": (BROWN, 4, (0, 1, 6, 7, 2, 3, 4, 5)),
+    "OPENCV_FISHEYE": (FISHEYE, 4, (0, 1, 2, 3)),
+    "SIMPLE_RADIAL_FISHEYE": (FISHEYE, 3, (0,)),
+    "RADIAL_FISHEYE": (FISHEYE, 3, (0, 1)),
+}
+N_COEFFICIENTS = {BROWN: 8, FISHEYE: 4, "orthographic": 0}
+
+
+def optics_of(lens: Lens, path: Path) -> Optics:
+    """Return what a lens of COLMAP does to directions; ``path`` is the photograph's, for the message.
+
+    Raises
+    ------
+    InputError
+        The model is not known.
+    """
+    if lens.model not in COEFFICIENTS:
+        raise InputError(
+            f"{path}: camera model {lens.model} is not one of {', '.join(COEFFICIENTS)}, which are drawn as"
+            " photographed; undistort the scene, or calibrate it with one of these"
+        )
+    name, n_pinhole, places = COEFFICIENTS[lens.model]
+    coefficients = [0.0] * N_COEFFICIENTS[name]
+    for place, value in zip(places, lens.params[n_pinhole:], strict=True):
+        coefficients[place] = float(value)
+    return Optics(name, tuple(coefficients))
 
 
 def import_pycolmap() -> ModuleType:

@@ -32,7 +32,7 @@ from minisplat_ref.io.images import (
     resize_image,
     resize_mask,
 )
-from minisplat_ref.io.lens import Lens, pinhole_of, undistort
+from minisplat_ref.io.lens import Lens, optics_of, pinhole_of, undistort
 from minisplat_ref.io.names import is_file
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
@@ -76,13 +76,19 @@ class Reading(NamedTuple):
     background: Floats
     """[3] in [0, 1]."""
     undistort: bool
-    """Warp photographs of other lenses to a pinhole; False refuses them."""
+    """Warp photographs of other lenses to a pinhole; False refuses them, unless they are read as photographed."""
     alpha_is_mask: bool
     """An alpha channel masks the loss; False composites it onto the background."""
+    as_photographed: bool = False
+    """Leave photographs of other lenses as they are, and describe the lens by the camera's ``optics``."""
 
 
 def build_reading(
-    downscale: int, background: Sequence[float] | Floats | None, undistort: bool, alpha_is_mask: bool
+    downscale: int,
+    background: Sequence[float] | Floats | None,
+    undistort: bool,
+    alpha_is_mask: bool,
+    as_photographed: bool = False,
 ) -> Reading:
     """Check the arguments that all loaders share."""
     if downscale < 1 or downscale != int(downscale):
@@ -90,7 +96,9 @@ def build_reading(
     color = np.zeros(3) if background is None else np.asarray(background, np.float64)
     if color.shape != (3,) or not np.all((color >= 0) & (color <= 1)):
         raise InputError(f"background is {background}; it must be three numbers in [0, 1]")
-    return Reading(int(downscale), color, undistort, alpha_is_mask)
+    if undistort and as_photographed:
+        raise InputError("photographs are either undistorted or read as they are: leave out one of the two")
+    return Reading(int(downscale), color, undistort, alpha_is_mask, as_photographed)
 
 
 def split_photos(photos: Sequence[Photo], test_every: int) -> tuple[list[Photo], list[Photo]]:
@@ -142,7 +150,7 @@ def build_scene(
             f" {TRAIN_VIEWS_MIN}; add photographs or hold out fewer"
         )
     for photo in photos:
-        check_photo(photo, source, reading.undistort)
+        check_photo(photo, source, reading.undistort or reading.as_photographed)
     _check_points(points, source)
     memory.check_photograph(source, max(_n_pixels(photo) for photo in photos), reading.downscale)
     _check_places(source, [photo.camera for photo in train_photos])
@@ -207,10 +215,10 @@ def _n_bytes(photo: Photo) -> int:
     return (3 + (photo.mask_path is not None)) * _n_pixels(photo)
 
 
-def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
-    """Raise an InputError for a photograph that cannot become a view."""
+def check_photo(photo: Photo, source: Path, takes_lens: bool) -> None:
+    """Raise an InputError for a photograph that cannot become a view; ``takes_lens``: one of any lens can."""
     camera = photo.camera
-    intrinsics = np.array(camera[2:], np.float64)
+    intrinsics = np.array(camera[2:8], np.float64)
     is_small = np.abs(intrinsics).max() <= COORDINATE_MAX  # False for NaN
     if not is_small or min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
         raise InputError(
@@ -223,10 +231,11 @@ def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
         is_rotation = np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(R) > 0  # False for NaN
     if not is_rotation or not np.abs(t).max() <= COORDINATE_MAX:
         raise InputError(f"{source}: the pose of {photo.file} is not a rotation and a translation; repair or remove it")
-    if photo.lens is not None and not undistort:
+    if photo.lens is not None and not takes_lens:
         raise InputError(
             f"{source}: {photo.file} has lens distortion (camera model {photo.lens.model}), only pinholes are rendered;"
-            f" run `minisplat-ref undistort {source} --out DIR`, or train with --undistort (undistort=True in Python)"
+            f" run `minisplat-ref undistort {source} --out DIR`, or train with --undistort (undistort=True in Python),"
+            " or as photographed with --recipe lens"
         )
     if photo.lens is not None and not np.isfinite(photo.lens.params).all():
         raise InputError(
@@ -284,7 +293,9 @@ def _camera(photo: Photo, reading: Reading) -> Camera:
         return rescale_camera(camera, width, height)
     if (width, height) != (camera.width, camera.height):
         raise InputError(_wrong_size(photo, path, width, height))
-    if photo.lens is not None:
+    if photo.lens is not None and reading.as_photographed:
+        camera = camera._replace(optics=optics_of(photo.lens, path))
+    elif photo.lens is not None:
         camera = pinhole_of(camera, photo.lens)
     return rescale_camera(camera, *downscaled_size(camera.width, camera.height, reading.downscale))
 
@@ -293,7 +304,7 @@ def _read_pixels(photo: Photo, reading: Reading, camera: Camera) -> Pixels:
     """Read one photograph for the camera of its view: alpha, mask, undistortion, downscaling, in this order."""
     image = read_image(_path(photo, reading))  # [H, W, 3 or 4]
     image, mask = _apply_alpha_and_mask(image, photo, reading)
-    if photo.lens is not None:
+    if photo.lens is not None and not reading.as_photographed:
         image, mask, _ = undistort(image, mask, photo.camera, photo.lens)
     return _resize(Pixels(image, mask), camera.width, camera.height)
 

@@ -45,6 +45,7 @@ def load_transforms(
     test_every: int = 8,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
+    as_photographed: bool = False,
 ) -> Scene:
     """Load a scene described by transforms.json.
 
@@ -62,6 +63,8 @@ def load_transforms(
         Colour in [0, 1] under transparent images and behind everything; black by default.
     undistort : bool
         Warp images with lens distortion to a pinhole, instead of refusing them.
+    as_photographed : bool
+        Leave them as they are, with cameras that have ``optics``.
 
     Returns
     -------
@@ -73,7 +76,7 @@ def load_transforms(
         If a file is missing or malformed, no image exists, there is distortion, or an image does not fit its camera.
     """
     path = Path(path)
-    reading = build_reading(downscale, background, undistort, alpha_is_mask=False)
+    reading = build_reading(downscale, background, undistort, False, as_photographed)
     files = find_transforms(path)
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")

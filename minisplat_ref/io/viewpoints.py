@@ -14,8 +14,9 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import check_n_pixels
 from minisplat_ref.io.json_file import as_array, as_number, read_json
+from minisplat_ref.io.lens import N_COEFFICIENTS
 from minisplat_ref.io.scene import COORDINATE_MAX, ROTATION_TOLERANCE
-from minisplat_ref.types import Camera, Scene
+from minisplat_ref.types import Camera, Optics, Scene
 
 NEEDED = "needed are position, rotation, width, height, fx, fy"
 
@@ -55,6 +56,7 @@ def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
             "cx": camera.cx,
             "cy": camera.cy,
             "time": time,
+            **({} if camera.optics is None else {"optics": [camera.optics.model, *camera.optics.coefficients]}),
         }
         for index, (name, camera, split, time) in enumerate(viewpoints)
     ]
@@ -100,8 +102,22 @@ def _viewpoint(entry: Any, where: str) -> Viewpoint:
     is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     if not is_rotation:
         raise InputError(f"{where}: rotation is not a rotation matrix")
-    camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, int(width), int(height))
+    optics = _optics(entry.get("optics"), where)
+    camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, int(width), int(height), optics)
     name, split = (entry.get(key, "") for key in ("img_name", "split"))
     if not (isinstance(name, str | int | float) and isinstance(split, str)):
         raise InputError(f"{where}: img_name and split must be text")
     return Viewpoint(str(name), camera, split, time)
+
+
+def _optics(value: Any, where: str) -> Optics | None:
+    """Return the optics of a camera that is no pinhole: a list of the model's name and its coefficients."""
+    if value is None:
+        return None
+    name, *coefficients = value if isinstance(value, list) and value else [None]
+    n_needed = N_COEFFICIENTS.get(name, -1) if isinstance(name, str) else -1
+    numbers = as_array(coefficients, (n_needed,)) if n_needed >= 0 else None
+    if numbers is None or not np.isfinite(numbers).all():
+        forms = " or ".join(f"{known!r} and {k} numbers" for known, k in N_COEFFICIENTS.items())
+        raise InputError(f"{where}: optics is not a list of {forms}")
+    return Optics(str(name), tuple(numbers.tolist()))

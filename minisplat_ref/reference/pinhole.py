@@ -6,6 +6,7 @@ Left out: lens distortion (images are undistorted beforehand) and rolling shutte
 import numpy as np
 
 from minisplat_ref.constants import JACOBIAN_CLAMP, Conventions
+from minisplat_ref.errors import InputError
 from minisplat_ref.types import Camera, Floats, Ints
 
 
@@ -72,6 +73,7 @@ def project_into_image(points: Floats, camera: Camera) -> tuple[Ints, Floats, Fl
     depths : ndarray of shape (Q,)
         Camera z, world units.
     """
+    _check_pinhole(camera)
     seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t
     rows = np.flatnonzero(seen[:, 2] > 0)
     xy = pinhole(seen[rows], camera)
@@ -96,6 +98,7 @@ def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floa
     ndarray of the broadcast shape and (3,)
         Camera frame.
     """
+    _check_pinhole(camera)
     slopes = (xs - camera.cx) / camera.fx, (ys - camera.cy) / camera.fy
     return np.stack(np.broadcast_arrays(*slopes, 1.0), axis=-1)
 
@@ -197,3 +200,18 @@ def with_principal_point(camera: Camera, conventions: Conventions) -> Camera:
     if conventions.uses_principal_point:
         return camera
     return camera._replace(cx=0.5 * camera.width, cy=0.5 * camera.height)
+
+
+def _check_pinhole(camera: Camera) -> None:
+    """Refuse a camera whose optics the formulas here would leave out without a word.
+
+    Raises
+    ------
+    InputError
+        It is no pinhole.
+    """
+    if camera.optics is not None:
+        raise InputError(
+            f"a {camera.optics.model} camera is no pinhole, which this step needs: train with --recipe lens, or with"
+            " --undistort and without lens"
+        )

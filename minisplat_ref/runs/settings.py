@@ -30,6 +30,7 @@ from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.lpips import Network, check_views, load_network
+from minisplat_ref.mechanisms.cameras.models import check_optics
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.model_file import label_for
 from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
@@ -278,14 +279,21 @@ def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
     InputError
         See :func:`minisplat_ref.io.load_scene`.
     """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
     scene = load_scene(
         settings.scene,
         downscale=settings.downscale,
         test_every=settings.test_every,
         background=settings.background,
         undistort=settings.undistort,
+        as_photographed=owner.representation.takes_optics and not settings.undistort,
         model=settings.model,
     )
+    for view in (*scene.train_views, *scene.test_views):
+        try:
+            check_optics(view.camera)
+        except InputError as error:
+            raise InputError(f"{settings.scene}: photograph {view.name}: {error}") from None
     return place_scene(scene, frame)
 
 

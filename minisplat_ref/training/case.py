@@ -13,7 +13,7 @@ from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import fields_of
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.types import Camera, Floats, Model, Scene, View
+from minisplat_ref.types import Camera, Floats, Model, Optics, Scene, View
 
 _KIND = "case"  # distinguishes the file from a checkpoint
 
@@ -73,7 +73,8 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
         "settings": dict(settings),
         "recipe": [case.recipe.name, case.recipe.iterations],
         "view": {"name": view.name, "view_id": view.view_id, "time": view.time},
-        "intrinsics": [float(value) for value in camera[2:]],
+        "intrinsics": [float(value) for value in camera[2:8]],
+        "optics": None if camera.optics is None else [camera.optics.model, camera.optics.coefficients],
         "extent": float(case.scene.extent),
         "request": {
             "sh_degree": None if isinstance(degree, np.ndarray) else degree,
@@ -99,7 +100,9 @@ class SavedCase(NamedTuple):
         """Return the case, with the recipe's type of population."""
         arrays, about, request = self.arrays, self.metadata["view"], self.metadata["request"]
         fx, fy, cx, cy, width, height = self.metadata["intrinsics"]
-        camera = Camera(arrays["view.R"], arrays["view.t"], fx, fy, cx, cy, int(width), int(height))
+        optics = self.metadata.get("optics")  # of a file without it: none
+        optics = None if optics is None else Optics(optics[0], tuple(optics[1]))
+        camera = Camera(arrays["view.R"], arrays["view.t"], fx, fy, cx, cy, int(width), int(height), optics)
         view = View(image=arrays["view.image"], camera=camera, mask=None, **about)
         view = view._replace(mask=arrays.get("view.mask"), point_ids=arrays.get("view.point_ids"))
         points = arrays["scene.points"]

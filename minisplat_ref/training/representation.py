@@ -41,6 +41,8 @@ class Representation(NamedTuple):
     renderer: Renderer = SPLATTING
     rates: Rates = Rates({}, frozenset())
     """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
+    takes_optics: bool = False
+    """Whether the renderer draws through lenses; then scenes are read as photographed."""
     units: Units = WORLD_UNITS
     """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
     extends: frozenset[str] = frozenset()

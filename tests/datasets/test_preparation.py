@@ -27,7 +27,7 @@ def assert_same_views(scene, other, check_images):
         assert a.name == b.name
         np.testing.assert_allclose(a.camera.cam_from_world_R, b.camera.cam_from_world_R, atol=SAME_CAMERAS)
         np.testing.assert_allclose(a.camera.cam_from_world_t, b.camera.cam_from_world_t, atol=SAME_CAMERAS)
-        np.testing.assert_allclose(a.camera[2:], b.camera[2:], rtol=SAME_CAMERAS)
+        np.testing.assert_allclose(a.camera[2:8], b.camera[2:8], rtol=SAME_CAMERAS)
         if check_images:
             np.testing.assert_array_equal(a.image, b.image)
         np.testing.assert_array_equal(a.mask, b.mask)
@@ -48,7 +48,7 @@ def test_downscale(tmp_path, rng, capsys):
         np.testing.assert_array_equal(read_image(tmp_path / "images_5" / name), resize_image(image, 6, 5))
     ready_made = load_scene(tmp_path, downscale=5)
     for a, b in zip(on_the_fly.train_views, ready_made.train_views, strict=True):
-        assert a.camera[2:] == b.camera[2:] and a.image.shape == b.image.shape
+        assert a.camera[2:8] == b.camera[2:8] and a.image.shape == b.image.shape
 
 
 def test_downscale_of_a_folder_of_images(tmp_path):
@@ -112,7 +112,7 @@ def test_undistort_transforms_agrees_with_loading_undistorted(tmp_path, rng):
     expected = load_scene(scene, undistort=True)
     assert_same_views(undistorted, expected, check_images=True)
     np.testing.assert_array_equal(undistorted.points, expected.points)
-    assert expected.test_views[0].camera[2:] != expected.train_views[1].camera[2:]  # the frame with its own k1
+    assert expected.test_views[0].camera[2:8] != expected.train_views[1].camera[2:8]  # the frame with its own k1
     assert json.loads((tmp_path / "out" / "transforms.json").read_text())["aabb_scale"] == 4
 
 

@@ -326,6 +326,7 @@ TABLES = {
     "mini-splatting2": MINI_SPLATTING2,
     "mini-splatting2-d": MINI_SPLATTING2_D,
     "analytic": GS_ACCEL,
+    "lens": GS_ACCEL,
     "antialiasing": {name.replace("reset_opacity", "reset_smoothed_opacity"): row for name, row in GS_ACCEL.items()}
     | rows(
         "Mip-Splatting, equations (7) to (9) and released code",

@@ -80,7 +80,7 @@ def test_blender(tmp_path, rng, background):
     assert [view.name for view in scene.test_views] == ["test_0000", "test_0001"]
     np.testing.assert_array_equal(scene.background, background or (0, 0, 0))
     for view in scene.train_views:
-        assert view.camera[2:] == pytest.approx((32.0, 32.0, 16.0, 12.0, 32, 24), rel=CLOSED_FORM)  # square pixels
+        assert view.camera[2:8] == pytest.approx((32.0, 32.0, 16.0, 12.0, 32, 24), rel=CLOSED_FORM)  # square pixels
         assert view.mask is None
         np.testing.assert_array_equal(view.image[: HEIGHT // 2], colored_image(int(view.name[-4:]))[: HEIGHT // 2])
         assert (view.image[HEIGHT // 2 :] == np.rint(255 * scene.background)).all()
@@ -135,9 +135,9 @@ def test_intrinsics_per_frame_masks_and_points(tmp_path):
     write_image(tmp_path / "masks" / "one.png", mask[:, :16])
     scene = load_transforms(tmp_path)
     views = views_of(scene)
-    assert views["0001"].camera[2:] == (50.0, 42.0, 14.0, 12.25, 16, HEIGHT)
+    assert views["0001"].camera[2:8] == (50.0, 42.0, 14.0, 12.25, 16, HEIGHT)
     np.testing.assert_array_equal(views["0001"].mask, mask[:, :16])
-    assert views["0002"].camera[2:] == (40.0, 42.0, 15.5, 12.25, WIDTH, HEIGHT)
+    assert views["0002"].camera[2:8] == (40.0, 42.0, 15.5, 12.25, WIDTH, HEIGHT)
     assert views["0002"].mask is None
     np.testing.assert_array_equal(scene.points, points)  # applied_transform has been applied already
     np.testing.assert_allclose(center_of(views["0000"].camera), [0, 0, 5], atol=CLOSED_FORM)
@@ -150,7 +150,7 @@ def test_downscaling(tmp_path):
         write_image(tmp_path / "images_2" / f"{i:04d}.png", colored_image(9 - i, 16, 12))
     view = views_of(load_transforms(tmp_path, downscale=2))["0001"]
     np.testing.assert_array_equal(view.image, colored_image(8, 16, 12))
-    assert view.camera[2:] == (20.0, 21.0, 7.75, 6.125, 16, 12)
+    assert view.camera[2:8] == (20.0, 21.0, 7.75, 6.125, 16, 12)
 
 
 # instant-ngp
@@ -200,7 +200,7 @@ def test_fox_agrees_with_colmap(shared_data):
             assert a.name == b.name
             np.testing.assert_allclose(a.camera.cam_from_world_R, b.camera.cam_from_world_R, atol=SAME_CAMERAS)
             np.testing.assert_allclose(a.camera.cam_from_world_t, b.camera.cam_from_world_t, atol=SAME_CAMERAS)
-            np.testing.assert_allclose(a.camera[2:], b.camera[2:], rtol=SAME_CAMERAS)
+            np.testing.assert_allclose(a.camera[2:8], b.camera[2:8], rtol=SAME_CAMERAS)
             np.testing.assert_array_equal(a.image, b.image)
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.compositing.pixel_rows import hit_row
+from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, reduce_any, scatter, select, store
@@ -73,11 +73,12 @@ def load_queued(queue, at):
     return (*near, *far)
 
 
-def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable) -> Callable:
+def walk_sorted(response: KernelResponse, n_channels: int, take: Callable) -> Callable:
     """Return a function that passes the hits of a row to ``take``, nearest first, and returns their number.
 
     ``take(state, hits, rows, frame)`` reads and changes ``state``, whose first eight numbers are the transmittances.
     """
+    hit, shade, hit_row = response.hit, response.shade, response.hit_row
 
     @scalar
     def walk(state, buffer, primitives, row, buffer_size, frame):

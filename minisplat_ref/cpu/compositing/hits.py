@@ -47,7 +47,7 @@ def composite_hits(
     """Blend the primitives of every tile, front to back; see ``reference.compositing.composite_hits``."""
     height, width, dtype, n_channels = bins.grid.height, bins.grid.width, colors.dtype, len(background)
     image, alpha = np.empty((height, width, n_channels), dtype), np.empty((height, width), dtype)
-    records = KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives))
+    records = _bundle(response, primitives, colors)
     lists, frame = lists_of(bins, response), frame_of(bins, conventions, dtype)
     forward_kernel(_find_shared(response), n_channels)(
         records, background, lists, frame, n_threads(), _pixels(image, alpha, dtype)
@@ -91,7 +91,7 @@ def composite_hits_vjp(
     slots = np.empty((len(bins.gaussian_ids), response.n_gradients + n_channels * response.n_coefficients), dtype)
     v_backgrounds = np.zeros((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(_find_shared(response), n_channels)(
-        KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
+        _bundle(response, primitives, colors),
         lists_of(bins, response),
         frame_of(bins, conventions, dtype),
         n_threads(),
@@ -121,7 +121,7 @@ def removal_changes_of_hits(
     dtype, n_channels = colors.dtype, output.image.shape[2]
     changes = np.zeros(len(bins.gaussian_ids), dtype)
     removal_kernel(_find_shared(response), n_channels)(
-        KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
+        _bundle(response, primitives, colors),
         lists_of(bins, response),
         frame_of(bins, conventions, dtype),
         n_threads(),
@@ -137,6 +137,14 @@ def lists_of(bins: TileBins, response: KernelResponse) -> Lists:
     """Return the lists of the tiles in the form that plain kernels take."""
     size = bins.grid.tile_width, bins.grid.tile_height
     return Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots, *size, response.buffer_size)
+
+
+def _bundle(response: KernelResponse, primitives: Any, colors: Floats) -> KernelPrimitives:
+    """Return the primitives as the kernels read them."""
+    records, boxes = response.records(primitives, colors.dtype), response.boxes(primitives)
+    if response.rays is None:
+        return KernelPrimitives(records, colors, boxes)
+    return KernelPrimitives(records, colors, boxes, response.rays(primitives, colors.dtype))
 
 
 def _find_shared(response: KernelResponse) -> KernelResponse:

@@ -6,9 +6,11 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, select
+from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, load, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.types import Floats, Ints
+
+NO_RAYS = np.zeros((0, 0))  # float64
 
 
 class KernelPrimitives(NamedTuple):
@@ -17,6 +19,7 @@ class KernelPrimitives(NamedTuple):
     records: Floats  # [N, F] of the response
     colors: Floats  # [N, S] coefficients of D channels
     boxes: Ints  # [N, 4] pixels x0, y0, x1, y1, half-open
+    rays: Floats = NO_RAYS  # [3 H, W + 7] directions of pixels, for responses that read them
 
 
 class Lists(NamedTuple):
@@ -116,5 +119,18 @@ def hit_row(hit, primitives, n, row):
     as_data = primitives.records.dtype.type
     xs = iota(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
     unclamped, depth, place = hit(primitives.records, n, xs, as_data(row.y) + HALF)
+    is_in_box = (xs > primitives.boxes[n, 0]) & (xs < primitives.boxes[n, 2])
+    return select(is_in_box, unclamped, ZERO), depth, place
+
+
+@scalar
+def hit_ray_row(hit, primitives, n, row):
+    """Do :func:`hit_row` for a response that takes the pixels' rays, three components, in place of x."""
+    as_data = primitives.records.dtype.type
+    xs = iota(as_data(0)) + (as_data(row.x) + HALF)
+    line = 3 * row.y
+    x, y = load(primitives.rays[line], row.x), load(primitives.rays[line + 1], row.x)
+    ray = x, y, load(primitives.rays[line + 2], row.x)
+    unclamped, depth, place = hit(primitives.records, n, ray, as_data(row.y) + HALF)
     is_in_box = (xs > primitives.boxes[n, 0]) & (xs < primitives.boxes[n, 2])
     return select(is_in_box, unclamped, ZERO), depth, place

@@ -37,7 +37,6 @@ from minisplat_ref.cpu.compositing.hit_buffer import ALPHA, CHANNELS, V_ALPHA, W
 from minisplat_ref.cpu.compositing.pixel_rows import (
     field_of,
     full_transmittance,
-    hit_row,
     list_rows,
     row_of_tile,
     row_pixels,
@@ -65,6 +64,7 @@ from minisplat_ref.scalar.compositing import blend, blend_vjp
 def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     """Compile the forward kernel for a response and a number of channels."""
     hit, shade, is_sorted = response.hit, response.shade, response.buffer_size > LIST_ORDER
+    hit_row = response.hit_row
 
     @scalar
     def composite_row(state, primitives, row, frame):
@@ -88,7 +88,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         for k in range(n_channels):
             accumulate(state, (1 + k) * WIDTH, weight * gather(hits, rows, CHANNELS + k))
 
-    composite_sorted_row = walk_sorted(hit, shade, n_channels, take)
+    composite_sorted_row = walk_sorted(response, n_channels, take)
 
     @kernel()
     def composite_tiles(primitives, background, lists, frame, n_threads, out):
@@ -121,6 +121,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     """Compile the backward kernel for a response and a number of channels."""
     hit, hit_vjp, shade, shade_vjp = response.hit, response.hit_vjp, response.shade, response.shade_vjp
+    hit_row = response.hit_row
     n_gradients, n_coefficients, n_places = response.n_gradients, response.n_coefficients, response.n_places
     n_sums, is_sorted = n_gradients + n_channels * n_coefficients, response.buffer_size > LIST_ORDER
     behind_place, v_first = WIDTH, 2 * WIDTH  # of a state, after the transmittance
@@ -186,7 +187,7 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         scatter(hits, rows, V_ALPHA, v_alpha)
         scatter(hits, rows, WEIGHT, weight)
 
-    walk = walk_sorted(hit, shade, n_channels, take)
+    walk = walk_sorted(response, n_channels, take)
 
     @scalar
     def chain_sorted_row(sums, v_place, buffer, state, primitives, row, buffer_size, frame):

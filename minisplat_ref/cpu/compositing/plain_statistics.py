@@ -20,7 +20,6 @@ from minisplat_ref.cpu.compositing.hit_buffer import ALPHA, CHANNELS, V_ALPHA, W
 from minisplat_ref.cpu.compositing.pixel_rows import (
     field_of,
     full_transmittance,
-    hit_row,
     list_rows,
     row_of_tile,
     row_pixels,
@@ -54,7 +53,7 @@ _MEDIAN_TRANSMITTANCE = np.float32(MEDIAN_TRANSMITTANCE)
 @functools.cache
 def statistics_kernel(response: KernelResponse) -> Callable:
     """Compile the kernel of blend statistics and median depths for a response."""
-    hit, is_sorted = response.hit, response.buffer_size > LIST_ORDER
+    hit, hit_row, is_sorted = response.hit, response.hit_row, response.buffer_size > LIST_ORDER
 
     @scalar
     def blend_one(state, unclamped, depth, frame):
@@ -92,7 +91,7 @@ def statistics_kernel(response: KernelResponse) -> Callable:
             if not reduce_any(load(state, 0) > ZERO):
                 break
 
-    walk = walk_sorted(with_depth(hit), depth_of, 1, _take(blend_one))
+    walk = walk_sorted(response._replace(hit=with_depth(hit), shade=depth_of), 1, _take(blend_one))
 
     @scalar
     def count_sorted_row(pairs, buffer, state, primitives, row, buffer_size, frame):
@@ -164,6 +163,7 @@ def removal_kernel(response: KernelResponse, n_channels: int) -> Callable:
     another quantity.
     """
     hit, shade, is_sorted = response.hit, response.shade, response.buffer_size > LIST_ORDER
+    hit_row = response.hit_row
 
     @scalar
     def blend_one(state, unclamped, frame):
@@ -203,7 +203,7 @@ def removal_kernel(response: KernelResponse, n_channels: int) -> Callable:
             total = total + change_of(state, k, weight * gather(hits, rows, CHANNELS + k), hit_odds)
         scatter(hits, rows, V_ALPHA, total)
 
-    walk = walk_sorted(hit, shade, n_channels, take)
+    walk = walk_sorted(response, n_channels, take)
 
     @kernel()
     def remove_from_tiles(primitives, lists, frame, n_threads, image, changes):

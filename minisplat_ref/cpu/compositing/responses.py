@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import LIST_ORDER
+from minisplat_ref.cpu.compositing.pixel_rows import hit_ray_row, hit_row
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.literals import TWO
 from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors, mahalanobis
@@ -66,11 +67,19 @@ class KernelResponse(NamedTuple):
     """Of each channel: those of channel k are ``colors[n, k * n_coefficients :]``."""
     n_places: int = 0
     """Numbers at the start of a place that colours depend on."""
+    rays: Callable[[Any, np.dtype], Floats] | None = None
+    """Maps primitives and a dtype to the pixels' directions [3 H, W + 7]: then the ``x`` of ``hit`` is the three
+    components of a ray. By default hits depend on the pixels' centres alone."""
     buffer_size: int = LIST_ORDER
     """Size of each pixel's k-buffer: when it is full, the pixel takes the nearest of the hits in it.
 
     ``LIST_ORDER`` = 1 takes hits in the order of the list, ``EXACT_ORDER`` buffers any number.
     """
+
+    @property
+    def hit_row(self) -> Callable:
+        """Function that calls ``hit`` for eight pixels of a line."""
+        return hit_row if self.rays is None else hit_ray_row
 
 
 # Columns of a conic's record; the depth has no derivative.
