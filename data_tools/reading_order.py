@@ -157,7 +157,7 @@ ORDER = (
                     "extensions/texture_splat/",
                     "extensions/discretized_sdf/",
                 ),
-                (),
+                (22,),
                 "materials blended, then shaded per pixel in an environment that is learned; opacity from distances",
             ),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
