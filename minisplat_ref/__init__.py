@@ -66,3 +66,8 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value
     return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names, which completion in a notebook offers before they are loaded."""
+    return sorted(__all__)

@@ -1,9 +1,10 @@
 """What the commands' arguments share: the look of help and errors, and the types of values."""
 
 import argparse
+import difflib
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
@@ -19,11 +20,41 @@ SYNTHETIC_SCENES = (  # datasets.synthetic.SCENE_NAMES, which would load NumPy
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, like those of bad input."""
+    """An argument parser whose errors are one line, like those of bad input, and say what was probably meant.
+
+    Options are not abbreviated: a script that says ``--iter`` would break when another option begins with that.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Parse, and refuse what is left over here, where the command's own options are known."""
+        parsed, surplus = super().parse_known_args(args, namespace)
+        if surplus:
+            options = [option for action in self._actions for option in action.option_strings]
+            unknown = next((word for word in surplus if word.startswith("-")), "")
+            self.error(f"unrecognized arguments: {' '.join(surplus)}{did_you_mean(unknown.partition('=')[0], options)}")
+        return parsed, surplus
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += did_you_mean(str(value), [str(choice) for choice in action.choices or ()])
+            raise
 
     def error(self, message: str) -> NoReturn:
         """Print one line to stderr and exit with code 2."""
         self.exit(2, f"minisplat-ref: error: {message} (see: {self.prog} --help)\n")
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
+    """Return a question that names the choice that a word was probably meant to be; empty where none is near."""
+    choices = sorted(choices)
+    beginning = [choice for choice in choices if word.strip("-") and choice.startswith(word)]
+    near = beginning or difflib.get_close_matches(word, choices, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

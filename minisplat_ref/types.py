@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from minisplat_ref.showing import as_bytes, one_line, to_png, to_sheet
+
 Floats = NDArray[np.floating]
 Ints = NDArray[np.integer]
 Bools = NDArray[np.bool_]
@@ -38,6 +40,9 @@ class Gaussians(NamedTuple):
     """[N, 3] spherical-harmonic coefficient of degree 0, RGB; colour = 0.5 + SH_C0 * sh_dc + ..."""
     sh_rest: Floats
     """[N, K-1, 3] coefficients of degree 1 and above; K = (degree + 1)^2, so K - 1 is 0, 3, 8 or 15."""
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
 
 class Primitives(NamedTuple):
@@ -64,6 +69,9 @@ class Model(NamedTuple):
     """A population: :class:`Gaussians`, or another NamedTuple of arrays [N, ...] whose first field is ``means``."""
     shared: Mapping[str, Floats] = NOTHING
     """Arrays without rows, by name: an exposure or a pose for each photograph, the weights of a network."""
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
 
 class Optics(NamedTuple):
@@ -247,6 +255,13 @@ class RenderOutput(NamedTuple):
     n_pairs: int = 0
     """Pairs (tile, Gaussian) of the view, or what a renderer lists instead; memory grows with them."""
 
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def _repr_png_(self) -> bytes:
+        """Return the image for a notebook."""
+        return to_png(as_bytes(self.image))
+
 
 class CompositeGradient(NamedTuple):
     """Gradient of the loss with respect to the inputs of :func:`composite`."""
@@ -317,6 +332,14 @@ class View(NamedTuple):
     time: float = 0.0
     """When it was taken, in the scene's own unit, usually from 0 to 1; for scenes that move."""
 
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the photograph for a notebook, if there is one."""
+        image = self.load().image
+        return to_png(image) if image.size else None
+
     def load(self) -> "View":
         """Return a view that holds its pixels: itself, or a copy if the view reads its pixels on demand.
 
@@ -369,3 +392,11 @@ class Scene(NamedTuple):
     frame: Frame = FILE_FRAME
     """The frame of cameras, points and extent: that of the files, unless :func:`minisplat_ref.io.frames.place_scene`
     has moved or scaled the scene."""
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def _repr_png_(self) -> bytes:
+        """Return a sheet of the first photographs for a notebook."""
+        images = (view.load().image for view in (*self.train_views, *self.test_views))
+        return to_png(to_sheet(image for image in images if image.size))

@@ -180,6 +180,7 @@ notes = {
     "jit": "compiling, lanes",
     "validation": "checks of input",
     "types": "arrays",
+    "showing": "one line, a picture",
     "constants": "conventions",
     "errors": "bad input",
     "reporting": "tables",

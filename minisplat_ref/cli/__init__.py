@@ -17,7 +17,7 @@ import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TextIO
+from typing import Any, TextIO
 
 from minisplat_ref import __version__
 from minisplat_ref.arguments import HelpFormatter, Parser
@@ -64,6 +64,29 @@ Your own photos:   minisplat-ref photos PHOTOS --out mine
 EPILOG = "Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."
 
 
+class PrintCompletion(argparse.Action):
+    """Prints a script for a shell, by shtab, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *values: Any, **options: Any) -> None:
+        """Print the script for the shell that was named."""
+        try:
+            import shtab
+        except ImportError:
+            raise InputError("completion needs shtab: pip install 'minisplat_ref[completion]'") from None
+        listed = argparse._SubParsersAction._ChoicesPseudoAction
+        for commands in (action for action in parser._actions if isinstance(action, argparse._SubParsersAction)):
+            # Back from the headings of the help: shtab completes what is listed here, and shown.
+            commands.help = ""
+            commands._choices_actions.extend(
+                action
+                for group in parser._action_groups
+                for action in group._group_actions
+                if isinstance(action, listed)
+            )
+        print(shtab.complete(parser, values[1]))
+        parser.exit(0)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands; ``args.run`` is the function of the chosen one, None where there is none."""
     parser = Parser(
@@ -85,6 +108,13 @@ def build_parser() -> argparse.ArgumentParser:
         commands._choices_actions.clear()
     options = parser.add_argument_group("options")
     options.add_argument("-h", "--help", action="help", help="show this message; COMMAND --help explains a command")
+    options.add_argument(
+        "--completion",
+        action=PrintCompletion,
+        metavar="SHELL",
+        choices=("bash", "zsh", "tcsh"),
+        help="print what bash, zsh or tcsh is to source",
+    )
     options.add_argument("--version", action="version", version=f"minisplat-ref {__version__}", help="show the version")
     return parser
 

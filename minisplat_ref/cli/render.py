@@ -66,7 +66,7 @@ def add_parser(commands: Commands) -> None:
         "--map", choices=MAPS, metavar="MAP", help="also NAME_MAP.png: albedo, metallic, roughness, normal"
     )
     parser.add_argument(
-        "--environment", type=Path, metavar="FILE", help="other light: an image by latitude and longitude"
+        "--environment", type=Path, metavar="FILE", help="other light by latitude and longitude: image or .npy"
     )
     parser.add_argument("--extension", metavar="E", help="draws a file; core is 3DGS (default: what it names)")
     parser.add_argument(

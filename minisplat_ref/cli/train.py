@@ -104,9 +104,9 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="adaptive (default), 3dgs-accel, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
-        " mini-splatting2-d",
+        help="adaptive (default), 3dgs[-accel], mini-splatting[2][-d]",
     )
+    training.add_argument("--config", type=Path, metavar="JSON", help="run, or its config.json, whose settings to take")
     training.add_argument("--init", type=Path, metavar="START", help="points (PLY) or run to start from")
     training.add_argument(
         "--iterations",
@@ -171,6 +171,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _start(given: dict[str, Any]) -> int:
+    if "config" in given:
+        given = _with_config(given)
     if "scene" not in given:
         raise InputError("give a SCENE to train on, or --resume DIR to continue a run")
     surplus = [option for name, option in (("moved", "--scene"), ("rescale", "--rescale")) if name in given]
@@ -220,6 +222,20 @@ def _start(given: dict[str, Any]) -> int:
             if state.step == 0:
                 run_folder.remove(folder)
             raise
+
+
+def _with_config(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments with the settings of another run where the command line has none."""
+    from minisplat_ref.runs.run_folder import CONFIG
+    from minisplat_ref.runs.settings import load
+
+    path: Path = given["config"]
+    config = load(path.parent if path.name == CONFIG else path)
+    settings: dict[str, Any] = {name: getattr(config, name) for name in ("scene", *DEFAULTS)}
+    settings["set"] = [*config.set.items(), *given.get("set", ())]
+    for name in ("lpips_weights", "init"):
+        settings[name] = None if settings[name] is None else Path(settings[name])
+    return {**settings, **given, "set": settings["set"]}
 
 
 def _check_time(settings: "Settings", recipe: "Recipe") -> None:
@@ -277,7 +293,7 @@ def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "Tra
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:
-    surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name not in AFRESH]
+    surplus = [name for name in ("scene", "out", "config", *DEFAULTS) if name in given and name not in AFRESH]
     if surplus:
         raise InputError(
             f"--resume takes the run's own settings: leave out {', '.join(option_name(name) for name in surplus)}"

@@ -127,6 +127,18 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
 
 
+def test_a_run_is_repeated_from_its_config(run_folder, tmp_path):
+    """The same bytes; what the command line gives takes the place of what the file says."""
+    config, again, other = run_folder / "config.json", tmp_path / "again", tmp_path / "other"
+    assert main(["train", "--config", str(config), "--out", str(again)]) == 0
+    assert (again / "point_cloud.ply").read_bytes() == (run_folder / "point_cloud.ply").read_bytes()
+    assert read_json(again / "config.json")["settings"] == read_json(config)["settings"]
+    changed = ["--iterations", "2", "--set", "exposure=true", "--out", str(other)]
+    assert main(["train", "--config", str(run_folder), *changed]) == 0  # the folder will do, too
+    settings = read_json(other / "config.json")["settings"]
+    assert (settings["iterations"], settings["seed"], settings["set"]) == (2, 3, {"exposure": "true"})
+
+
 def test_train_logs_every_few_steps(run_folder):
     log = read_log(run_folder / "log.jsonl")
     assert [record["step"] for record in log] == list(range(LOG_EVERY, ITERATIONS + 1, LOG_EVERY))
@@ -384,17 +396,39 @@ print("LOADED", {{"numba", "numpy", "scipy", "pycolmap", "matplotlib", "PIL", "t
     assert done.stdout.splitlines()[-1] == "LOADED set()"
 
 
+def spelled_out(word):
+    """Return what a word with parts in brackets stands for: a[-b] for a and a-b."""
+    before, bracket, rest = word.partition("[")
+    part, _, after = rest.partition("]")
+    return spelled_out(before + part + after) | spelled_out(before + after) if bracket else {word}
+
+
 def test_help_names_all_that_there_is(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     text = capsys.readouterr().out
-    assert all(re.search(rf"\b{recipe}\b", text) for recipe in RECIPES)
+    assert set(RECIPES) <= {name for word in text.split() for name in spelled_out(word.strip(","))}
     assert set(BACKEND_CHOICES) == set(BACKENDS)
     assert SYNTHETIC_SCENES == SCENE_NAMES
     with pytest.raises(SystemExit):
         main(["synthetic", "--help"])
     text = capsys.readouterr().out
     assert all(re.search(rf"^  {name} +[a-z]", text, re.MULTILINE) for name in SCENE_NAMES)
+
+
+def test_a_shell_completes_commands_and_options(capsys, monkeypatch):
+    with pytest.raises(SystemExit, match="0"):
+        main(["--completion", "bash"])
+    script = capsys.readouterr().out
+    complete = "COMP_WORDS=(minisplat-ref {0}); COMP_CWORD={1}; _shtab_minisplat_ref; echo ${{COMPREPLY[@]}}"
+    for words, cursor, expected in (("tr", 1, "train"), ("train --downs", 2, "--downscale")):
+        done = subprocess.run(
+            ["bash", "-c", f"{script}\n{complete.format(words, cursor)}"], capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split() == [expected]
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["--completion", "zsh"]) == 2
+    assert "pip install 'minisplat_ref[completion]'" in capsys.readouterr().err
 
 
 def test_every_command_module_is_a_command(capsys):

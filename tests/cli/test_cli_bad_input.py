@@ -44,6 +44,36 @@ def train_refused(refused, tmp_path):
     return run
 
 
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["tran", "x"], "train"),
+        (["train", "x", "--downscal", "2"], "--downscale"),
+        (["train", "x", "--iter=2"], "--iterations"),  # not an abbreviation, though it begins like one
+        (["train", "x", "--sead", "2"], "--seed"),
+        (["oracle", "gradient"], "gradients"),
+        (["train", "x", "--backend", "cppu"], "cpu"),
+        (["train", "x", "--nothing-like-it"], None),
+        (["train", "x", "y"], None),
+    ],
+)
+def test_what_was_probably_meant(words, meant, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ("did you mean" in line) == (meant is not None)
+    assert meant is None or f"; did you mean {meant}? (see: minisplat-ref " in line
+
+
+def test_a_config_that_is_none(refused, tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    assert "config.json is not the configuration of a training" in refused(
+        "train", "--config", tmp_path / "config.json"
+    )
+    assert "nowhere" in refused("train", "--config", tmp_path / "nowhere")
+    assert "leave out --config" in refused("train", "--resume", tmp_path, "--config", tmp_path / "config.json")
+
+
 def gaussians(n=4):
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     return Gaussians(np.zeros((n, 3)), quats, np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 0, 3)))
