@@ -51,10 +51,11 @@ class Parser(argparse.ArgumentParser):
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """Return a question that names the choice that a word was probably meant to be; empty where none is near."""
-    choices = sorted(choices)
-    beginning = [choice for choice in choices if word.strip("-") and choice.startswith(word)]
-    near = beginning or difflib.get_close_matches(word, choices, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
+    bare = {choice.strip("-"): choice for choice in sorted(choices)}
+    word = word.strip("-")
+    beginning = [name for name in bare if word and name.startswith(word)]
+    near = beginning or difflib.get_close_matches(word, bare, n=1, cutoff=0.7)
+    return f"; did you mean {bare[near[0]]}?" if near else ""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

@@ -17,6 +17,7 @@ import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any, TextIO
 
 from minisplat_ref import __version__
@@ -53,6 +54,9 @@ GROUPS = {
     "the program itself": (extensions, cache),
 }
 """The commands under the headings of ``--help``."""
+
+EXTRAS = {"matplotlib": "photos"}
+"""Packages that commands draw with, by the extra that brings them."""
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,
@@ -213,6 +217,17 @@ def _print_warnings_in_one_line() -> None:
     warnings.showwarning = show_input_warning
 
 
+def _check_packages(needed: Sequence[str]) -> None:
+    """Refuse a command before it begins whose end would need a package that is not there."""
+    for package in needed:
+        if find_spec(package) is None:
+            raise InputError(_missing(package))
+
+
+def _missing(package: str) -> str:
+    return f"this needs {package}, which is not installed: pip install 'minisplat_ref[{EXTRAS[package]}]'"
+
+
 def _run(argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
     try:
@@ -221,10 +236,17 @@ def _run(argv: Sequence[str]) -> int:
         if args.run is None:
             parser.print_help()
             return 0
+        _check_packages(getattr(args, "needs", ()))
         code: int = args.run(args)
         sys.stdout.flush()
     except InputError as error:
         print(f"minisplat-ref: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        print(f"minisplat-ref: error: {_missing(package)}", file=sys.stderr)
         return 2
     except MemoryError:
         print("minisplat-ref: error: memory is full: give less at a time (--downscale, --size)", file=sys.stderr)

@@ -88,7 +88,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--init", type=Path, metavar="START", help="as for train: points or run to start from")
     parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:

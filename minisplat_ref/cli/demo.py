@@ -42,7 +42,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--iterations", type=integer(1), default=ITERATIONS, metavar="N", help=f"of the training (default {ITERATIONS})"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--parts", type=integer(1), default=50, metavar="N", help="keep the N largest connected parts (default 50)"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:

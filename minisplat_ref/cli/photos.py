@@ -54,7 +54,7 @@ def add_parser(commands: Commands) -> None:
         metavar="M",
         help="exhaustive (default), or sequential for frames of a video",
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -55,7 +55,7 @@ def add_parser(commands: Commands) -> None:
     fine_tune = f"iterations at each size (default {FINE_TUNE})"
     parser.add_argument("--fine-tune", type=integer(0), default=FINE_TUNE, metavar="N", help=fine_tune)
     parser.add_argument("--scene", type=Path, metavar="PATH", help="where the photographs are now, if they have moved")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -158,7 +158,7 @@ def add_parser(commands: Commands) -> None:
     )
     training.add_argument("--drop-bad-steps", action="store_true", help="skip steps with NaN instead of stopping")
     add_renderer_arguments(training, argparse.SUPPRESS)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:

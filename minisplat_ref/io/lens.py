@@ -75,8 +75,8 @@ def import_pycolmap() -> ModuleType:
         import pycolmap
     except ImportError:
         raise InputError(
-            "pycolmap, which reads COLMAP models and undistorts images, is not installed;"
-            " run `pip install pycolmap`, or describe the scene with a transforms.json"
+            "pycolmap, which reads COLMAP models and undistorts images, is not installed: pip install"
+            " 'minisplat_ref[photos]', or describe the scene with a transforms.json"
         ) from None
     return pycolmap
 

@@ -3,7 +3,7 @@
 import platform
 import reprlib
 from collections.abc import Mapping
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +42,7 @@ from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Model, Scene
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
 SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters of any recipe
-REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
+REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")  # those that are installed
 
 
 class Settings(NamedTuple):
@@ -185,9 +185,17 @@ def load_model(folder: Path, settings: Settings) -> Model:
     return place_model(Model(gaussians, shared), owner, load_frame(folder))
 
 
+def _version_of(package: str) -> str | None:
+    """Return the version of a package, None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
     """Return what ``config.json`` holds: the settings, the recipe spelled out, and the versions that run it."""
-    versions = {package: version(package) for package in REPORTED_PACKAGES}
+    versions = {package: found for package in REPORTED_PACKAGES if (found := _version_of(package)) is not None}
     return {
         "settings": settings._asdict(),
         "background": scene.background.tolist(),

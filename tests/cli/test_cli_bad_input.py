@@ -55,6 +55,7 @@ def train_refused(refused, tmp_path):
         (["train", "x", "--backend", "cppu"], "cpu"),
         (["train", "x", "--nothing-like-it"], None),
         (["train", "x", "y"], None),
+        (["render", "x", "--scene", "y"], None),  # not --backend
     ],
 )
 def test_what_was_probably_meant(words, meant, capsys):

@@ -412,5 +412,5 @@ def test_nothing_there(tmp_path):
 
 def test_pycolmap_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(InputError, match=r"pycolmap, .* is not installed; run `pip install pycolmap`"):
+    with pytest.raises(InputError, match=r"pycolmap, .* is not installed: pip install 'minisplat_ref\[photos\]'"):
         load_colmap(write_colmap(tmp_path))
