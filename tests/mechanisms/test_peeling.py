@@ -223,6 +223,30 @@ def test_kernels_are_the_reference(max_layers, rng):
         assert_allclose(a, b, atol=PARITY_FLOAT64 * np.abs(b).max())
 
 
+@pytest.mark.parametrize("max_layers", [5, 1 << 30], ids=["five layers", "all"])
+@pytest.mark.parametrize("n", [kernels.FEW, kernels.FEW + 1, 3 * kernels.FEW])
+def test_few_and_many_layers_are_sorted(n, max_layers, rng):
+    """By insertion and by a heap: cards whose depths are shuffled, two of them equal."""
+    depths = rng.permutation(np.append(np.linspace(1, 4, n - 1), 2.5))
+    shades = rng.uniform(0.02, 0.2, (3 * n, 4))
+    mesh, frame = cards(depths, np.zeros((n, 4)))._replace(rgba=shades), frame_of(max_layers=max_layers)
+    (ours, v_ours), (theirs, v_theirs) = both(mesh, frame, rng)
+    assert theirs.n_layers.max() == n
+    assert_allclose(ours.image, theirs.image, atol=PARITY_FLOAT64)
+    for a, b in zip(v_ours, v_theirs, strict=True):
+        assert_allclose(a, b, atol=PARITY_FLOAT64 * np.abs(b).max())
+
+
+def test_fragments_are_the_same_with_and_without_room_for_boxes(rng, monkeypatch):
+    mesh, frame = soup(rng, 80), frame_of()
+    listed = [kernels.peel(mesh, frame, BACKGROUND).tape.fragments]
+    monkeypatch.setattr(kernels, "ROOM_MAX", 0)
+    listed.append(kernels.peel(mesh, frame, BACKGROUND).tape.fragments)
+    assert len(listed[0].pixels) > 1000
+    for ours, theirs in zip(*listed, strict=True):
+        assert_array_equal(ours, theirs)
+
+
 def test_float32_and_threads(rng):
     """Some pixels on an edge belong to another triangle in float32; all others are as near as those of 3DGS."""
     mesh, camera = soup(rng, 80), make_camera(50, 37, fx=60.0, fy=55.0, rng=rng)

@@ -5,7 +5,8 @@ pixels. Here each triangle writes down which pixels it covers, its *fragments*, 
 
     triangles, in parallel      by triangle  | 0: f f f | 1: f | 2: f f ... |   pixel, b_1, b_2, 1/t of each fragment
     a counting sort             by pixel     | 0: f f | 1: f f f | ...          the same, as indices
-    pixels, in parallel         a heap, from which the nearest is taken, blended, and put at the end of what is left
+    pixels, in parallel         sorted, the nearest last; many of them by a heap, from which the nearest is taken,
+                                blended, and put at the end of what is left
 
 Backward, pixels give every fragment its derivative with respect to alpha, then triangles add up their own fragments.
 Each number has one writer, and sums have one order, whatever the number of threads.
@@ -42,6 +43,8 @@ G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the
 N_COLUMNS = 9
 SLACK = 1e-6  # px that boxes and rows are too large by
 PIXELS_PER_CHUNK = 64
+ROOM_MAX = 1 << 24  # pixels of all boxes, 270 MB in float32
+FEW = 24  # fragments of a pixel that are sorted by insertion
 
 
 class Pinhole(NamedTuple):
@@ -279,6 +282,7 @@ def span(planes, n, y, rays):
 def _count(planes, rays, counts):
     boxes = planes.boxes
     for n in prange(counts.size):
+        counts[n] = 0
         for y in range(boxes[n, 1], boxes[n, 3]):
             x0, x1 = span(planes, n, y, rays)
             for x in range(x0, x1):
@@ -286,9 +290,10 @@ def _count(planes, rays, counts):
 
 
 @kernel()
-def _list(planes, rays, fragments):
+def _list(planes, rays, rooms, counts):
+    """Write the fragments of triangle n from ``rooms.offsets[n]`` on, and count them."""
     boxes, anchors, c = planes.boxes, planes.anchors, planes.columns
-    offsets, pixels, places = fragments
+    offsets, pixels, places = rooms
     for n in prange(boxes.shape[0]):
         f = offsets[n]
         for y in range(boxes[n, 1], boxes[n, 3]):
@@ -303,6 +308,42 @@ def _list(planes, rays, fragments):
                 places[f, 1] = (c[n, G_2] + c[n, G_2 + 1] * dx + c[n, G_2 + 2] * dy) / s
                 places[f, 2] = s
                 f += 1
+        counts[n] = f - offsets[n]
+
+
+@kernel()
+def _move_together(rooms, fragments):
+    """Copy what is written of each triangle's room to where it belongs."""
+    starts, room_pixels, room_places = rooms
+    offsets, pixels, places = fragments
+    for n in prange(offsets.size - 1):
+        start, first = starts[n], offsets[n]
+        for i in range(offsets[n + 1] - first):
+            pixels[first + i] = room_pixels[start + i]
+            for k in range(3):
+                places[first + i, k] = room_places[start + i, k]
+
+
+def _fragments_of(planes: Planes, rays: Rays, dtype: np.dtype) -> Fragments:
+    """Return the fragments of all triangles, in the order of these.
+
+    A triangle gets as much room as its box has pixels, is drawn into it once, and its fragments are then moved
+    together. Where all boxes would take too much memory, fragments are counted before.
+    """
+    extents = planes.boxes[:, 2:] - planes.boxes[:, :2]
+    sizes = np.prod(extents, axis=1, dtype=np.int64)
+    if sizes.sum() > ROOM_MAX:
+        _count(planes, rays, sizes)
+    rooms, counts = _empty_fragments(sizes, dtype), np.empty_like(sizes)
+    _list(planes, rays, rooms, counts)
+    fragments = _empty_fragments(counts, dtype)
+    _move_together(rooms, fragments)
+    return fragments
+
+
+def _empty_fragments(counts: Ints, dtype: np.dtype) -> Fragments:
+    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    return Fragments(offsets, np.empty(offsets[-1], np.int32), np.empty((offsets[-1], 3), dtype))
 
 
 @kernel(parallel=False)
@@ -340,6 +381,17 @@ def sift_down(ids, i, n, places):
         i = child
 
 
+@scalar
+def sort_few(ids, places):
+    """Sort the fragments of a pixel by insertion, the nearest last."""
+    for i in range(1, ids.size):
+        f, j = ids[i], i
+        while j > 0 and is_nearer(places, ids[j - 1], f):
+            ids[j] = ids[j - 1]
+            j -= 1
+        ids[j] = f
+
+
 @kernel()
 def _shade(fragments, faces, rgba, shades):
     """Interpolate colours and alphas."""
@@ -360,15 +412,20 @@ def _blend(layers, places, shades, background, max_layers, n_threads, out):
         for chunk in dynamic_range(taken, (n_pixels + PIXELS_PER_CHUNK - 1) // PIXELS_PER_CHUNK):
             for p in range(chunk * PIXELS_PER_CHUNK, min((chunk + 1) * PIXELS_PER_CHUNK, n_pixels)):
                 ids = layers.ids[layers.offsets[p] : layers.offsets[p + 1]]
-                for i in range(ids.size // 2 - 1, -1, -1):
-                    sift_down(ids, i, ids.size, places)
+                is_sorted = ids.size <= FEW
+                if is_sorted:
+                    sort_few(ids, places)
+                else:
+                    for i in range(ids.size // 2 - 1, -1, -1):
+                        sift_down(ids, i, ids.size, places)
                 T, n_left = shades.dtype.type(1), ids.size
                 image[p, :] = ZERO
                 while n_left > max(ids.size - max_layers, 0):
-                    f = ids[0]
                     n_left -= 1
-                    ids[0], ids[n_left] = ids[n_left], f
-                    sift_down(ids, 0, n_left, places)
+                    if not is_sorted:
+                        ids[0], ids[n_left] = ids[n_left], ids[0]
+                        sift_down(ids, 0, n_left, places)
+                    f = ids[n_left]
                     for k in range(3):
                         image[p, k] += shades[f, 3] * T * shades[f, k]
                     transmittances[f] = T
@@ -446,13 +503,9 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     fx, fy, cx, cy = map(float, (camera.fx, camera.fy, camera.cx, camera.cy))
     pinhole = Pinhole(fx, fy, cx, cy, float(frame.near), ANGLE_MIN, camera.width, camera.height)
     _set_up(vertices, mesh.faces, pinhole, planes)
-    counts = np.zeros(n, np.int64)
     rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, fx, pinhole.near)
-    _count(planes, rays, counts)
-    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
-    n_fragments = int(offsets[-1])
-    fragments = Fragments(offsets, np.empty(n_fragments, np.int32), np.empty((n_fragments, 3), dtype))
-    _list(planes, rays, fragments)
+    fragments = _fragments_of(planes, rays, dtype)
+    n_fragments = len(fragments.pixels)
     layers = Layers(np.zeros(n_pixels + 1, np.int64), np.empty(n_fragments, np.int64))
     _sort_by_pixel(fragments.pixels, layers.offsets, layers.ids)
 
@@ -466,7 +519,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
         image.reshape(*size, 3),
         (1 - T_end).reshape(size),
         np.diff(layers.offsets).reshape(size),
-        counts > 0,
+        np.diff(fragments.offsets) > 0,
         Tape(vertices, fragments, layers, shades, transmittances, n_blended, T_end),
     )
 
