@@ -38,7 +38,7 @@ def add_parser(commands: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs")
+    parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs, or a video")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for all of it (default splats/PHOTOS)")
     parser.add_argument("--minutes", type=positive, metavar="T", help="the most minutes to train (default: as needed)")
     parser.add_argument(
@@ -50,24 +50,25 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--matching",
         choices=MATCHINGS,
-        default=MATCHINGS[0],
         metavar="M",
-        help="exhaustive (default), or sequential for frames of a video",
+        help="exhaustive (default), or sequential (default of a video)",
     )
     parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the steps that have not been done, and say where their results are."""
+    from minisplat_ref.datasets.video import is_video
     from minisplat_ref.reports.commands import command
     from minisplat_ref.runs import run_folder, settings
 
-    folder = args.out or Path("splats") / args.photos.resolve().name
+    folder = args.out or Path("splats") / args.photos.resolve().with_suffix("").name
     scene, trained, film = (folder / name for name in (SCENE, RUN, FILM))
-    if not args.photos.is_dir():
-        raise InputError(f"{args.photos} is no folder: give the folder of your photographs")
+    if not args.photos.is_dir() and not is_video(args.photos):
+        raise InputError(f"{args.photos} is no folder and no video: give the folder of your photographs")
     if not scene.exists():
-        _do("sfm", args.photos, "--out", scene, "--matching", args.matching)
+        matching = () if args.matching is None else ("--matching", args.matching)
+        _do("sfm", args.photos, "--out", scene, *matching)
     if not run_folder.has_begun(trained):
         factor = _choose_factor(scene) if args.downscale is None else args.downscale
         limit = () if args.minutes is None else ("--minutes", f"{args.minutes:g}")

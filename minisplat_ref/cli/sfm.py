@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter, integer
 
 if TYPE_CHECKING:
     from minisplat_ref.datasets.sfm import SfmResult
@@ -28,6 +28,7 @@ Photographs of another size, camera or focal length may be mixed in.
 EPILOG = """\
 examples:
   minisplat-ref sfm holiday/fountain --out scenes/fountain
+  minisplat-ref sfm holiday/walk.mp4 --every 10 --out scenes/walk
   minisplat-ref train scenes/fountain --downscale 3 --out runs/fountain"""
 
 
@@ -40,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs")
+    parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs, or a video")
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="new folder for the scene")
     parser.add_argument(
         "--long-side", type=int, default=1600, metavar="PX", help="shrink larger photographs to this (default 1600)"
@@ -56,9 +57,14 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--matching",
         choices=MATCHINGS,
-        default=MATCHINGS[0],
         metavar="M",
-        help="exhaustive: every pair (default), or sequential: neighbours, for frames of a video",
+        help="exhaustive: every pair (default), or sequential: neighbours (default of a video)",
+    )
+    parser.add_argument(
+        "--every",
+        type=integer(1),
+        metavar="N",
+        help="of each N frames of a video take the sharpest (default: of half a second)",
     )
     parser.add_argument(
         "--camera-model",
@@ -72,17 +78,19 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene, say how it was found, and how to train on it."""
-    from minisplat_ref.datasets.sfm import run_sfm
+    from minisplat_ref.datasets.sfm import default_matching, run_sfm
 
+    matching = args.matching or default_matching(args.photos)
     result = run_sfm(
         args.photos,
         args.out,
         long_side=args.long_side,
-        matching=args.matching,
+        matching=matching,
+        every=args.every,
         features=args.features,
         camera_model=args.camera_model,
     )
-    print("\n".join(_summarize(result, args.out, args.matching)))
+    print("\n".join(_summarize(result, args.out, matching)))
     return 0
 
 

@@ -11,13 +11,13 @@ from collections import Counter
 from pathlib import Path
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.images import BY_PRODUCT, IMAGE_SUFFIXES
+from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, readable_suffixes
 
 UNREAD_SUFFIXES = (
-    *(".heic", ".heif", ".avif", ".jxl"),
+    *(".avif", ".jxl"),
     *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
 )
-"""Formats of phones and cameras that Pillow does not decode."""
+"""Formats of cameras that are not decoded."""
 MASKS = "masks"
 """Folder of masks beside the photographs."""
 SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
@@ -41,20 +41,23 @@ def list_images(folder: Path) -> list[Path]:
     sorted_out = [(file, _by_product(folder, file)) for file in found]
     photos = [file for file, by_product in sorted_out if by_product is None]
     by_products = [(file, by_product) for file, by_product in sorted_out if by_product is not None]
-    files = [folder / file for file in photos if file.suffix.lower() in IMAGE_SUFFIXES]
+    suffixes = readable_suffixes()
+    files = [folder / file for file in photos if file.suffix.lower() in suffixes]
     others = [str(file) for file in photos if file.suffix.lower() in UNREAD_SUFFIXES]
     problems = []
+    if heif := [str(file) for file in photos if file.suffix.lower() in HEIF_SUFFIXES and folder / file not in files]:
+        problems.append(f"{len(heif)} HEIC photographs ({enumerate_names(heif)}): pip install 'minisplat_ref[heic]'")
     if others:
         problems.append(
             f"{len(others)} photographs of formats that are not read ({enumerate_names(others)}): convert them to JPEG"
         )
-    left_out = Counter(by_product for file, by_product in by_products if file.suffix.lower() in IMAGE_SUFFIXES)
+    left_out = Counter(by_product for file, by_product in by_products if file.suffix.lower() in suffixes)
     if left_out:
         names = enumerate_names([name if n == 1 else f"{name} with {n} images" for name, n in left_out.items()])
         problems.append(f"what is hidden or a by-product of other programs ({names})")
     if not files:
         instead = f", but {' and '.join(problems)}" if problems else ""
-        raise InputError(f"{folder}: no images in it (looked for {' '.join(IMAGE_SUFFIXES)}){instead}")
+        raise InputError(f"{folder}: no images in it (looked for {' '.join(suffixes)}){instead}")
     for problem in problems:
         warnings.warn(one_line(f"{folder}: leaving out {problem}"), InputWarning, stacklevel=2)
     return files

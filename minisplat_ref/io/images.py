@@ -17,6 +17,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,9 @@ from minisplat_ref.types import Bools, Floats
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
+
+HEIF_SUFFIXES = (".heic", ".heif")
+"""Photographs of telephones, which pillow-heif reads, the extra ``heic``."""
 
 BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)
 """Files and folders that are hidden, or that programs put beside photographs."""
@@ -49,6 +53,11 @@ _LOCK = threading.Lock()  # Pillow's limit and Python's warning filters are shar
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 
+def readable_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of photographs that can be read here, with those of packages that are installed."""
+    return (*IMAGE_SUFFIXES, *(HEIF_SUFFIXES if find_spec("pillow_heif") else ()))
+
+
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
     """Open an image file with Pillow; any error in decoding becomes an InputError that names the file.
@@ -56,6 +65,10 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     Pillow's limit of pixels, beyond which it reports a decompression bomb, is below the size of phone photographs; ours
     is :data:`PIXELS_MAX`. Pillow's warnings, such as damaged EXIF data, do not matter here. One thread at a time.
     """
+    if path.suffix.lower() in HEIF_SUFFIXES and find_spec("pillow_heif"):
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
     try:
         with _LOCK, _File(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")

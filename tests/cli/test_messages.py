@@ -87,20 +87,35 @@ def test_damaged_exif_data_are_no_warning(tmp_path):
     assert not is_turned(tmp_path / "a.jpg")
 
 
-def test_heic_and_raw_photographs_are_named(tmp_path, capsys):
-    for name in ("b.HEIC", "c.dng", "notes.txt"):
+def test_heic_is_read_where_pillow_heif_is_installed(tmp_path, monkeypatch):
+    heif = pytest.importorskip("pillow_heif")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    write_image(photos / "a.jpg", colored_image(1))
+    heif.from_pillow(Image.fromarray(colored_image(2))).save(photos / "b.HEIC", quality=100)
+    assert list_images(photos) == [photos / "a.jpg", photos / "b.HEIC"]
+    assert np.abs(read_image(photos / "b.HEIC").astype(int) - colored_image(2)).max() <= 8  # it is not lossless
+    monkeypatch.setattr(images_module, "find_spec", lambda name: None)
+    with pytest.warns(
+        InputWarning, match=r"leaving out 1 HEIC photographs \(b\.HEIC\): pip install 'minisplat_ref\[heic\]'"
+    ):
+        assert list_images(photos) == [photos / "a.jpg"]
+
+
+def test_raw_photographs_are_named(tmp_path, capsys):
+    for name in ("b.CR2", "c.dng", "notes.txt"):
         (tmp_path / "photos" / "d").mkdir(parents=True, exist_ok=True)
         (tmp_path / "photos" / name).write_bytes(b"raw")
     (tmp_path / "photos" / "d" / "e.nef").write_bytes(b"raw")
-    message = r"but 3 photographs of formats that are not read \(b\.HEIC, c\.dng, d/e\.nef\): convert them to JPEG"
+    message = r"but 3 photographs of formats that are not read \(b\.CR2, c\.dng, d/e\.nef\): convert them to JPEG"
     with pytest.raises(InputError, match=message):
         list_images(tmp_path / "photos")
     write_image(tmp_path / "photos" / "a.jpg", colored_image(1))
-    with pytest.warns(InputWarning, match=r"leaving out 3 photographs of formats .* \(b\.HEIC, c\.dng, d/e\.nef\): "):
+    with pytest.warns(InputWarning, match=r"leaving out 3 photographs of formats .* \(b\.CR2, c\.dng, d/e\.nef\): "):
         assert list_images(tmp_path / "photos") == [tmp_path / "photos" / "a.jpg"]
     assert main(["downscale", str(tmp_path / "photos")]) == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("minisplat-ref: warning: ") and "b.HEIC" in line
+    assert line.startswith("minisplat-ref: warning: ") and "b.CR2" in line
     for i in range(30):
         (tmp_path / "photos" / f"{i:02d}.arw").write_bytes(b"raw")
     with pytest.warns(InputWarning, match=r"leaving out 33 photographs .*, 19\.arw and 13 more\): convert"):

@@ -24,6 +24,7 @@ from minisplat_ref.datasets.sfm.judging import Matches, choose, read_matches
 from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
 from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
 from minisplat_ref.datasets.undistort import undistort_colmap
+from minisplat_ref.datasets.video import is_video, keep_sharpest
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos
@@ -57,12 +58,18 @@ class SfmResult(NamedTuple):
     """Width and height of each photograph in the scene, pixels."""
 
 
+def default_matching(photos: Path) -> str:
+    """Return how photographs are matched unless told otherwise: the frames of a video with their neighbours."""
+    return "sequential" if is_video(photos) else "exhaustive"
+
+
 def run_sfm(
     photos: Path,
     out: Path,
     *,
     long_side: int = 1600,
-    matching: str = "exhaustive",
+    matching: str | None = None,
+    every: int | None = None,
     features: str = "auto",
     camera_model: str = "SIMPLE_RADIAL",
 ) -> SfmResult:
@@ -71,13 +78,15 @@ def run_sfm(
     Parameters
     ----------
     photos : Path
-        Folder of photographs.
+        Folder of photographs, or a video.
     out : Path
         Folder to make.
     long_side : int
         Photographs with a longer side are shrunk to this, pixels.
-    matching : str
-        "exhaustive": every pair. "sequential": neighbours in the order of file names, for videos.
+    matching : str, optional
+        "exhaustive": every pair. "sequential": neighbours in the order of file names, for videos, whose default it is.
+    every : int, optional
+        Frames of a video of which the sharpest is kept; those of half a second by default.
     features : str
         "standard": COLMAP's own setting. "dense": more features, matched more thoroughly, which takes longer. "auto":
         standard, then dense if that leaves photographs without a place or gives few points; the better result is kept.
@@ -95,9 +104,17 @@ def run_sfm(
     """
     if long_side < 1:
         raise InputError(f"--long-side is {long_side}; it must be positive")
+    if every is not None and not is_video(photos):
+        raise InputError(f"--every is for a video, which {photos} is not: leave it out")
+    matching = matching or default_matching(photos)
     with making_folder(out) as folder, TemporaryDirectory(dir=folder) as temporary:
         work = Path(temporary)
-        photographs = prepare_photos(photos, work, long_side)
+        source = photos
+        if is_video(photos):
+            source = work / "frames"
+            source.mkdir()
+            keep_sharpest(photos, source, every)
+        photographs = prepare_photos(source, work, long_side)
         n_photos = len(photographs.originals)
         if n_photos < 2:
             raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")

@@ -1,0 +1,100 @@
+"""Photographs from a video: of every few frames the sharpest one.
+
+A hand that holds a camera moves unevenly, so of neighbouring frames some are sharp and some are blurred. Sharpness is
+the mean square of the Laplacian of the brightness: between frames of one place it falls with blur, while its value says
+nothing between places.
+"""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from tqdm import tqdm
+
+from minisplat_ref.errors import InputError, one_line
+from minisplat_ref.io.images import DAMAGE_ERRORS, write_image
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".gif")
+SECONDS = 0.5  # of a video, from which one frame is kept
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a path is a file whose suffix is a video's."""
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def keep_sharpest(video: Path, folder: Path, every: int | None = None) -> list[Path]:
+    """Write the sharpest of every few frames into a folder, as ``frame_00017.png`` by their numbers.
+
+    Parameters
+    ----------
+    video : Path
+        What ffmpeg reads.
+    folder : Path
+        It exists.
+    every : int, optional
+        Frames of which one is kept; those of half a second by default.
+
+    Raises
+    ------
+    InputError
+        ffmpeg is missing, the file is no video, or it has no frames.
+    """
+    kept: list[Path] = []
+    best: tuple[float, int, NDArray[np.uint8]] | None = None
+    frames, every = _read(video, every)
+    for i, frame in enumerate(tqdm(frames, desc="frames", unit=" frames", leave=False, disable=None)):
+        value = sharpness(frame)
+        if best is None or value > best[0]:
+            best = value, i, frame
+        if (i + 1) % every == 0:
+            kept.append(_write(folder, best))
+            best = None
+    if best is not None:
+        kept.append(_write(folder, best))
+    if not kept:
+        raise InputError(f"{video}: no frames in it; record it again, or export it as MP4")
+    return kept
+
+
+def sharpness(frame: NDArray[np.uint8]) -> float:
+    """Return the mean square of the Laplacian of the brightness of a frame [H, W, 3]."""
+    return float(np.mean(ndimage.laplace(frame.astype(np.float32) @ LUMA) ** 2))
+
+
+def _write(folder: Path, best: tuple[float, int, NDArray[np.uint8]]) -> Path:
+    path = folder / f"frame_{best[1]:05}.png"
+    write_image(path, best[2])
+    return path
+
+
+def _read(video: Path, every: int | None) -> tuple[Iterator[NDArray[np.uint8]], int]:
+    """Return the frames [H, W, 3], and of how many one is to be kept."""
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise InputError(
+            f"{video}: videos need ffmpeg: pip install 'minisplat_ref[video]', or give a folder of frames"
+        ) from None
+    stream: Any = imageio_ffmpeg.read_frames(str(video))
+    try:
+        about = next(stream)  # of the whole video; frames follow
+    except (*DAMAGE_ERRORS, StopIteration) as error:
+        raise InputError(one_line(f"{video}: not a video that ffmpeg reads ({error}); export it as MP4")) from error
+    per_second = max(float(about["fps"]), 1.0)
+    return _frames(stream, about["size"], video), max(1, round(SECONDS * per_second)) if every is None else every
+
+
+def _frames(stream: Any, size: tuple[int, int], video: Path) -> Iterator[NDArray[np.uint8]]:
+    width, height = size
+    with closing(stream):
+        try:
+            for pixels in stream:
+                yield np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
+        except DAMAGE_ERRORS as error:
+            raise InputError(one_line(f"{video}: cannot be decoded ({error}); export it as MP4")) from error
