@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.out or Path("splats") / args.photos.resolve().with_suffix("").name
     scene, trained, film = (folder / name for name in (SCENE, RUN, FILM))
     if not args.photos.is_dir() and not is_video(args.photos):
-        raise InputError(f"{args.photos} is no folder and no video: give the folder of your photographs")
+        raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")
     if not scene.exists():
         matching = () if args.matching is None else ("--matching", args.matching)
         _do("sfm", args.photos, "--out", scene, *matching)

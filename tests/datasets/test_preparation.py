@@ -179,7 +179,7 @@ def test_pycolmap_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
     code = main(["undistort", str(scene), "--out", str(tmp_path / "out")])
-    assert_refused(capsys, tmp_path, code, "is not installed; run `pip install pycolmap`")
+    assert_refused(capsys, tmp_path, code, "is not installed: pip install 'minisplat_ref[photos]'")
 
 
 # scripts
