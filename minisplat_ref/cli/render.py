@@ -61,6 +61,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder, PLY or compact file")
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
+    parser.add_argument("--time", type=_moment, metavar="T", help="of every image (default: its camera's)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
     parser.add_argument(
         "--map", choices=MAPS, metavar="MAP", help="also NAME_MAP.png: albedo, metallic, roughness, normal"
@@ -115,7 +116,10 @@ def run(args: argparse.Namespace) -> int:
     names = file_names([view.name for view in views])
     wants = frozenset({"depth"} if args.depth else ()) | frozenset({args.map} if args.map else ())
     channels = _channels(args, source, wants)
-    outputs = (source.trained.render(view_from(view.camera, time=view.time), wants) for view in views)
+    outputs = (
+        source.trained.render(view_from(view.camera, time=view.time if args.time is None else args.time), wants)
+        for view in views
+    )
     first = next(outputs)  # what cannot be drawn is refused before the folder is touched
     _make_room(out, names)
     drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views), unit="view", disable=None)
@@ -134,6 +138,14 @@ def run(args: argparse.Namespace) -> int:
         write_film(args.film, [out / f"{name}.png" for name in names], args.fps)
         print(f"film: {args.film}")
     return 0
+
+
+def _moment(text: str) -> float:
+    """Read a finite number."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is no time")
+    return value
 
 
 def _channels(args: argparse.Namespace, source: "_Source", wants: frozenset[str]) -> dict[str, slice]:
