@@ -140,14 +140,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _moment(text: str) -> float:
-    """Read a finite number."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is no time")
-    return value
-
-
 def _channels(args: argparse.Namespace, source: "_Source", wants: frozenset[str]) -> dict[str, slice]:
     """Return the channels that are drawn, by name.
 
@@ -268,6 +260,16 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
     if not views:
         raise InputError(f"{args.input} has no {which} views: give --cameras train, orbit or a JSON file")
     return views
+
+
+def _moment(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time, a finite number")
+    return value
 
 
 def _arc(text: str) -> float:

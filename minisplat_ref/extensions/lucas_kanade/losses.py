@@ -31,7 +31,7 @@ from minisplat_ref.reference.pinhole import pose, project_into_image, with_princ
 from minisplat_ref.rendering import Request, activate, parameters_vjp
 from minisplat_ref.splatting import SplatTape, splat, splat_vjp
 from minisplat_ref.training.losses import Cotangents, Rendered
-from minisplat_ref.types import Floats, Gaussians, Ints, Model, Scene, SHGradient, View
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Scene, SHGradient, View
 
 SHAPE = ("means", "quats", "log_scales", "opacity_logits")  # of a Gaussian: a flow does not depend on its colours
 NEAR = 0.01  # world units: what is nearer to the second camera has no place in its image
@@ -125,10 +125,37 @@ def rendered_flow(model: Model, view: View, other: View, request: Request) -> tu
         For :func:`rendered_flow_vjp`.
     """
     there = moved(model, view.time)
-    g, dtype = there.gaussians, there.gaussians.means.dtype
-    first, second = (with_principal_point(each.camera, request.conventions) for each in (view, other))
     tau = power_steps(view.time, other.time - view.time, len(there.tau))
-    after = g.means + field(there.phi, model.shared[SHIFTS], tau)
+    after = there.gaussians.means + field(there.phi, model.shared[SHIFTS], tau)
+    splats, step, rows = blended_steps(there.gaussians, after, (view.camera, other.camera), request)
+    return splats.output.image[..., :2], splats.output.alpha, FlowTape(there, splats, step, rows, tau)
+
+
+def blended_steps(
+    g: Gaussians, after: Floats, cameras: tuple[Camera, Camera], request: Request
+) -> tuple[SplatTape, Step, Ints]:
+    """Blend how far Gaussians move in the image.
+
+    Parameters
+    ----------
+    g : Gaussians
+        At the time of the first camera, which shows them.
+    after : ndarray of shape (N, 3)
+        Where their centres are at the time of the second.
+    cameras : pair of Camera
+    request : Request
+
+    Returns
+    -------
+    splats : SplatTape
+        The image's first two channels are the flow, pixels; the third is 0.
+    step : Step
+        Of the rows.
+    rows : ndarray of shape (R,)
+        Gaussians that the first camera sees and the second has in front of itself; the others count as still.
+    """
+    dtype = g.means.dtype
+    first, second = (with_principal_point(camera, request.conventions) for camera in cameras)
     R, t = pose(second, dtype)
     is_in_front = (after @ R.T + t)[:, 2] > NEAR
     found: list[tuple[Ints, Step]] = []
@@ -142,9 +169,9 @@ def rendered_flow(model: Model, view: View, other: View, request: Request) -> tu
         return colors
 
     black = np.zeros(3, dtype)
-    splats = splat(activate(g, request.is_visible), shade, view.camera, black, request.conventions, request.backend)
+    splats = splat(activate(g, request.is_visible), shade, cameras[0], black, request.conventions, request.backend)
     ((rows, step),) = found
-    return splats.output.image[..., :2], splats.output.alpha, FlowTape(there, splats, step, rows, tau)
+    return splats, step, rows
 
 
 def rendered_flow_vjp(tape: FlowTape, v_flow: Floats, v_alpha: Floats) -> tuple[Gaussians, dict[str, Floats]]:

@@ -1,7 +1,7 @@
 """Optical flow between two photographs: the method of Lucas and Kanade, 1981, on a pyramid, in NumPy.
 
 In a window around each pixel the motion d is that for which the second image, moved back, is most like the first. With
-the gradient g of the images, their difference e and the sums over the window, one step solves
+the gradient g of the images, their difference e and the sums over window and colours, one step solves
 
     (sum g g^T + eps I) d = -sum g e
 
@@ -23,7 +23,7 @@ WINDOW = 2.0  # standard deviation of the window, pixels
 N_STEPS = 6  # per level
 SIDE_MIN = 16  # pixels of the coarsest level's shorter side
 DAMPING = 1e-6  # eps, of intensities from 0 to 1
-TEXTURE_MIN = 2e-4  # smaller eigenvalue of the window's mean of g g^T, per squared pixel
+TEXTURE_MIN = 3e-5  # smaller eigenvalue of the window's mean of g g^T, per squared pixel
 RETURN_MAX = 0.5  # pixels by which the flow there and back may miss
 
 
@@ -44,7 +44,7 @@ def optical_flow(first: NDArray[Any], second: NDArray[Any]) -> Flow:
     first, second : ndarray of shape (H, W, 3)
         Equally large; from 0 to 1, or uint8.
     """
-    a, b = (_grey(image) for image in (first, second))
+    a, b = (_intensities(image) for image in (first, second))
     there, back = _flow(a, b), _flow(b, a)
     misses = np.linalg.norm(there + _moved(back, there), axis=2)
     rows, columns = np.mgrid[: a.shape[0], : a.shape[1]]
@@ -53,17 +53,17 @@ def optical_flow(first: NDArray[Any], second: NDArray[Any]) -> Flow:
     return Flow(there, is_inside & (misses <= RETURN_MAX) & (_texture(a) >= TEXTURE_MIN))
 
 
-def _grey(image: NDArray[Any]) -> Floats:
-    scale = 1 / 255 if image.dtype == np.uint8 else 1.0
-    return np.asarray(image.astype(np.float64).mean(axis=2) * scale)
+def _intensities(image: NDArray[Any]) -> Floats:
+    return image.astype(np.float64) * (1 / 255 if image.dtype == np.uint8 else 1.0)
 
 
 def _flow(first: Floats, second: Floats) -> Floats:
     """Return the flow [H, W, 2] from coarse to fine."""
     levels = [(first, second)]
-    while min(levels[-1][0].shape) >= 2 * SIDE_MIN:
-        levels.append(tuple(ndimage.gaussian_filter(image, 1.0)[::2, ::2] for image in levels[-1]))
-    flow = np.zeros((*levels[-1][0].shape, 2))
+    while min(levels[-1][0].shape[:2]) >= 2 * SIDE_MIN:
+        a, b = (ndimage.gaussian_filter(image, (1.0, 1.0, 0.0))[::2, ::2] for image in levels[-1])
+        levels.append((a, b))
+    flow = np.zeros((*levels[-1][0].shape[:2], 2))
     for a, b in reversed(levels):
         flow = _enlarged(flow, a.shape)
         for _ in range(N_STEPS):
@@ -73,32 +73,34 @@ def _flow(first: Floats, second: Floats) -> Floats:
 
 def _step(first: Floats, moved: Floats) -> Floats:
     """Return the solution d of the windows' equations, [H, W, 2]."""
-    gy, gx = np.gradient((first + moved) / 2)
+    gy, gx = np.gradient((first + moved) / 2, axis=(0, 1))  # [H, W, 3]
     e = moved - first
-    xx, xy, yy, xe, ye = (
-        ndimage.gaussian_filter(product, WINDOW) for product in (gx * gx, gx * gy, gy * gy, gx * e, gy * e)
-    )
+    xx, xy, yy, xe, ye = (_in_window(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy), (gx, e), (gy, e)))
     xx, yy = xx + DAMPING, yy + DAMPING
     determinant = xx * yy - xy * xy
     step = np.stack([xy * ye - yy * xe, xy * xe - xx * ye], axis=2) / determinant[..., None]
     return np.clip(step, -1.0, 1.0)  # beyond a pixel the linear model says nothing
 
 
+def _in_window(a: Floats, b: Floats) -> Floats:
+    """Return the mean of a b over channels and window, [H, W]."""
+    return np.asarray(ndimage.gaussian_filter(np.mean(a * b, axis=2), WINDOW))
+
+
 def _texture(image: Floats) -> Floats:
     """Return the smaller eigenvalue of the mean of g g^T, [H, W]."""
-    gy, gx = np.gradient(image)
-    xx, xy, yy = (ndimage.gaussian_filter(product, WINDOW) for product in (gx * gx, gx * gy, gy * gy))
+    gy, gx = np.gradient(image, axis=(0, 1))
+    xx, xy, yy = (_in_window(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
     smaller: Floats = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
     return smaller
 
 
 def _moved(image: Floats, flow: Floats) -> Floats:
-    """Return the image [H, W] or [H, W, C] at where the flow leads, linearly interpolated; beyond the edge the edge."""
+    """Return the image [H, W, C] at where the flow leads, linearly interpolated; beyond the edge the edge."""
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
     places = [rows + flow[..., 1], columns + flow[..., 0]]
-    if image.ndim == 2:
-        return np.asarray(ndimage.map_coordinates(image, places, order=1, mode="nearest"))
-    return np.stack([_moved(channel, flow) for channel in np.moveaxis(image, 2, 0)], axis=2)
+    channels = np.moveaxis(image, 2, 0)
+    return np.stack([ndimage.map_coordinates(each, places, order=1, mode="nearest") for each in channels], axis=2)
 
 
 def _enlarged(flow: Floats, shape: tuple[int, ...]) -> Floats:

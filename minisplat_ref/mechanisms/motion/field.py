@@ -28,7 +28,7 @@ def powers(time: float, n: int) -> Floats:
 
 def power_rates(time: float, n: int) -> Floats:
     """Return ``dtau_p / dt = p t^(p - 1)`` for p = 1 .. n, [n] float64."""
-    p = np.arange(1, n + 1)
+    p = np.arange(1.0, n + 1)
     rates: Floats = p * np.power(float(time), p - 1)
     return rates
 
