@@ -35,5 +35,20 @@ motion, and the rotation of spherical harmonics with their Gaussian.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.lucas_kanade.method import LUCAS_KANADE, WARPED
 from minisplat_ref.extensions.lucas_kanade.stages import stages
+from minisplat_ref.studies.study import OUT, declare, iterations, seeds
 
-EXTENSION = Extension("lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages)
+FORMS = declare(
+    "forms",
+    "three forms of a velocity, and its integral, beside each other",
+    f"{__name__}.study.run_forms",
+    seeds(3),
+)
+BODY = declare(
+    "body",
+    "a turning, growing body with and without the flow loss",
+    f"{__name__}.study.run_body",
+    *(OUT, iterations(2000), seeds(3)),
+)
+EXTENSION = Extension(
+    "lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages, studies=(FORMS, BODY)
+)

@@ -73,7 +73,7 @@ def _flow(first: Floats, second: Floats) -> Floats:
 
 def _step(first: Floats, moved: Floats) -> Floats:
     """Return the solution d of the windows' equations, [H, W, 2]."""
-    gy, gx = np.gradient((first + moved) / 2, axis=(0, 1))  # [H, W, 3]
+    gy, gx = (np.gradient((first + moved) / 2, axis=axis) for axis in (0, 1))  # [H, W, C]
     e = moved - first
     xx, xy, yy, xe, ye = (_in_window(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy), (gx, e), (gy, e)))
     xx, yy = xx + DAMPING, yy + DAMPING
@@ -89,7 +89,7 @@ def _in_window(a: Floats, b: Floats) -> Floats:
 
 def _texture(image: Floats) -> Floats:
     """Return the smaller eigenvalue of the mean of g g^T, [H, W]."""
-    gy, gx = np.gradient(image, axis=(0, 1))
+    gy, gx = (np.gradient(image, axis=axis) for axis in (0, 1))
     xx, xy, yy = (_in_window(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
     smaller: Floats = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
     return smaller

@@ -21,8 +21,9 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.motion.field import basis, field, field_jacobians, power_rates, powers
 from minisplat_ref.types import Floats
 
-NEWTON_STEPS = 30  # of which 4 to 6 are taken where a warp is far from folding
-NEWTON_TOLERANCE = 1e-13  # of the largest coordinate, float64
+NEWTON_TIMES = 8  # from 0 to the wanted one: the solution at each is where the next begins
+NEWTON_STEPS = 20  # at each; 3 or 4 are taken where a warp is far from folding
+NEWTON_TOLERANCE = 1e-8  # of the largest coordinate, before the last step
 
 
 class Warp(NamedTuple):
@@ -88,6 +89,8 @@ def velocity_of_backward(jacobians: Floats, rates: Floats) -> Floats:
 def invert(warp: Warp, places: Floats, time: float) -> Floats:
     """Return the backward warp ``w(x, t)``, by Newton's method: ``y <- y - J^-1 (W(y, t) - x)``.
 
+    It begins at time 0, where y = x, because far from the solution its steps lead anywhere.
+
     Parameters
     ----------
     warp : Warp
@@ -100,14 +103,16 @@ def invert(warp: Warp, places: Floats, time: float) -> Floats:
     InputError
         Newton's method does not arrive: the warp folds space, and some place has no canonical one, or several.
     """
-    y = places.copy()
-    tolerance = NEWTON_TOLERANCE * max(1.0, float(np.abs(places).max(initial=0)))
-    for _ in range(NEWTON_STEPS):
-        residual = warp.at(y, time) - places
-        if np.abs(residual).max(initial=0) <= tolerance:
-            return y
-        y = y - np.einsum("nij,nj->ni", np.linalg.pinv(warp.jacobians(y, time)), residual)
-    raise InputError(f"the warp at time {time:g} has no inverse: it folds space; take a time nearer to 0")
+    y, tolerance = places, NEWTON_TOLERANCE * max(1.0, float(np.abs(places).max(initial=0)))
+    for moment in time * np.arange(1, NEWTON_TIMES + 1) / NEWTON_TIMES:
+        for _ in range(NEWTON_STEPS):
+            residuals = warp.at(y, moment) - places
+            y = y - np.einsum("nij,nj->ni", np.linalg.pinv(warp.jacobians(y, moment)), residuals)
+            if np.abs(residuals).max(initial=0) <= tolerance:  # the step after has squared the error
+                break
+        else:
+            raise InputError(f"the warp has no inverse at time {moment:g}, it folds space: take a time nearer to 0")
+    return y
 
 
 def integrate(velocity: Callable[[Floats, float], Floats], start: Floats, time: float, step: float, n: int) -> Floats:
