@@ -101,7 +101,7 @@ def invert(warp: Warp, places: Floats, time: float) -> Floats:
     Raises
     ------
     InputError
-        Newton's method does not arrive: the warp folds space, and some place has no canonical one, or several.
+        Newton's method does not converge, because the warp folds space: of several canonical places it may return any.
     """
     y, tolerance = places, NEWTON_TOLERANCE * max(1.0, float(np.abs(places).max(initial=0)))
     for moment in time * np.arange(1, NEWTON_TIMES + 1) / NEWTON_TIMES:
