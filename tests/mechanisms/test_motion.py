@@ -139,9 +139,9 @@ def test_a_canonical_step_does_what_time_does(rng, warp):
 
 
 def test_a_warp_that_folds_has_no_inverse():
-    warp = Warp(np.zeros((1, 3)), 1.0, np.array([[[5.0, 0, 0]]]))
+    warp = Warp(np.zeros((1, 3)), 1.0, np.array([[[20.0, 0, 0]]]))
     with pytest.raises(InputError, match="folds space"):
-        invert(warp, np.zeros((1, 3)), 1.0)
+        invert(warp, np.linspace(-1, 1, 9)[:, None] * [1, 0, 0], 1.0)
 
 
 # --- integration ---

@@ -9,7 +9,7 @@ and each of f, r and g is a sum of radial basis functions whose coefficients are
 (:mod:`minisplat_ref.mechanisms.motion.velocity`), among them that of Lucas and Kanade, ``J^+ dW/dt`` with J = dW/dx,
 and is integrated to scene flow by a step of Runge-Kutta. Two losses join the photometric one:
 
-    flow          1: |sum_i w_i (pi'(x_i(t')) - pi(x_i(t))) - A f| to the next photograph, in image widths
+    flow          5: |sum_i w_i (pi'(x_i(t')) - pi(x_i(t))) - A f| to the next photograph, in image widths
     depth_order   0: max(0, m + ln d_near - ln d_far) of pairs of pixels whose order of depth is known
 
 The flow f is found in the photographs by the classical method on a pyramid

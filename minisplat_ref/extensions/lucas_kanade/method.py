@@ -107,7 +107,7 @@ LUCAS_KANADE = GS_ACCEL._replace(
     name="lucas-kanade",
     losses=(
         *GS_ACCEL.losses,
-        LossTerm("flow", partial(flow, flows=""), 1.0),
+        LossTerm("flow", partial(flow, flows=""), 5.0),
         LossTerm("depth_order", partial(depth_order, depths="", margin=0.01), 0.0, frozenset({"depth"})),
     ),
 )

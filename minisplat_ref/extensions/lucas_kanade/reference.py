@@ -7,6 +7,8 @@ import numpy as np
 from minisplat_ref.reference.pinhole import pinhole, pinhole_vjp, pose
 from minisplat_ref.types import Bools, Camera, Floats, Ints
 
+SOFT = 0.1  # pixels: what the flow of photographs is right within
+
 
 def turned(quats: Floats, turns: Floats) -> Floats:
     """Return quaternions after a rotation about ``r`` by the angle ``2 arctan(|r| / 2)``.
@@ -79,10 +81,12 @@ def flow_error(flow: Floats, alpha: Floats, target: Floats, is_known: Bools) -> 
 
     ::
 
-        L = sum_p |F_p - A_p f_p|_1 / (P W)      over the P pixels at which f is known
+        L = sum_p rho(F_p - A_p f_p) / (P W)      over the P pixels at which f is known
+        rho(r) = sqrt(r_x^2 + e^2) + sqrt(r_y^2 + e^2) - 2 e
 
     F is the blend ``sum_i w_i f_i`` of the Gaussians' motions in the image, and A the accumulated opacity, so that each
-    Gaussian contributes ``w_i (f_i - f)``: one that is faint is not compared with the whole motion.
+    Gaussian contributes ``w_i (f_i - f)``: one that is faint is not compared with the whole motion. rho is the L1 norm
+    but for the kink at zero, which is round within e = SOFT pixels.
 
     Parameters
     ----------
@@ -95,14 +99,18 @@ def flow_error(flow: Floats, alpha: Floats, target: Floats, is_known: Bools) -> 
     is_known : ndarray of shape (H, W) of booleans
     """
     residuals = (flow - alpha[..., None] * target)[is_known]
-    return float(np.abs(residuals).sum()) / (max(len(residuals), 1) * flow.shape[1])
+    total = float(np.sum(np.hypot(residuals, residuals.dtype.type(SOFT)) - residuals.dtype.type(SOFT)))
+    return total / (max(len(residuals), 1) * flow.shape[1])
 
 
 def flow_error_vjp(flow: Floats, alpha: Floats, target: Floats, is_known: Bools) -> tuple[Floats, Floats]:
-    """Gradient of :func:`flow_error`: ``v_F = sign(F - A f) / (P W)`` and ``v_A = -f . v_F``."""
+    """Gradient of :func:`flow_error`: ``v_F = r / sqrt(r^2 + e^2) / (P W)``, r = F - A f, and ``v_A = -f . v_F``."""
     unit = flow.dtype.type(1 / (max(np.count_nonzero(is_known), 1) * flow.shape[1]))
-    v_flow = np.where(is_known[..., None], unit * np.sign(flow - alpha[..., None] * target), 0).astype(flow.dtype)
-    return v_flow, -np.sum(np.where(is_known[..., None], target, 0) * v_flow, axis=2)
+    known = np.where(is_known[..., None], target, 0)
+    residuals = flow - alpha[..., None] * known
+    slopes = residuals / np.hypot(residuals, residuals.dtype.type(SOFT))
+    v_flow = np.where(is_known[..., None], unit * slopes, 0).astype(flow.dtype)
+    return v_flow, -np.sum(known * v_flow, axis=2)
 
 
 class Pairs(NamedTuple):

@@ -21,7 +21,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.motion.field import basis, field, field_jacobians, power_rates, powers
 from minisplat_ref.types import Floats
 
-NEWTON_TIMES = 8  # from 0 to the wanted one: the solution at each is where the next begins
+NEWTON_TIMES = 4  # from 0 to the wanted one: the solution at each is where the next begins
 NEWTON_STEPS = 20  # at each; 3 or 4 are taken where a warp is far from folding
 NEWTON_TOLERANCE = 1e-8  # of the largest coordinate, before the last step
 
@@ -104,14 +104,18 @@ def invert(warp: Warp, places: Floats, time: float) -> Floats:
         Newton's method does not converge, because the warp folds space: of several canonical places it may return any.
     """
     y, tolerance = places, NEWTON_TOLERANCE * max(1.0, float(np.abs(places).max(initial=0)))
+    folded = InputError(f"the warp has no inverse at time {time:g}, it folds space: take a time nearer to 0")
     for moment in time * np.arange(1, NEWTON_TIMES + 1) / NEWTON_TIMES:
         for _ in range(NEWTON_STEPS):
             residuals = warp.at(y, moment) - places
-            y = y - np.einsum("nij,nj->ni", np.linalg.pinv(warp.jacobians(y, moment)), residuals)
+            try:
+                y = y - np.linalg.solve(warp.jacobians(y, moment), residuals[..., None])[..., 0]
+            except np.linalg.LinAlgError as error:
+                raise folded from error
             if np.abs(residuals).max(initial=0) <= tolerance:  # the step after has squared the error
                 break
         else:
-            raise InputError(f"the warp has no inverse at time {moment:g}, it folds space: take a time nearer to 0")
+            raise folded
     return y
 
 
