@@ -228,8 +228,9 @@ def test_gaussians_move_turn_and_grow():
 # --- gradients and backends ---
 
 
-def test_the_gradient_of_the_whole_model(backend, small_proof):
-    report = check_model_gradients(backend, GSPLAT_MAIN, WARPED)
+def test_the_gradient_of_the_whole_model():
+    """On kernels; those of the reference agree with them, below."""
+    report = check_model_gradients(CPU, GSPLAT_MAIN, WARPED)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 
 
@@ -405,15 +406,15 @@ def test_forms_are_measured(capsys):
 
 def test_the_study_measures_its_arms(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(bodies, "N_GAUSSIANS", 60)
-    monkeypatch.setattr(bodies, "N_FRAMES", 7)
+    monkeypatch.setattr(bodies, "N_FRAMES", 6)
     for name, value in (("WIDTH", 48), ("HEIGHT", 32), ("FOCAL", 55.0)):
         monkeypatch.setattr(bodies, name, value)
     out = tmp_path / "out"
-    assert main(["study", "lucas-kanade/body", "--iterations", "40", "--seeds", "1", "--out", str(out)]) == 0
+    assert main(["study", "lucas-kanade/body", "--iterations", "30", "--seeds", "0", "--out", str(out)]) == 0
     records = {record["arm"]: record for record in json.loads((out / "result.json").read_text())["records"]}
-    assert list(records) == [f"{camera}, {arm}" for camera in study.CAMERAS for arm in study.ARMS]
+    assert list(records) == [f"{camera}, {arm}" for camera in study.CAMERAS for arm in study.LOSSES]
     for camera in study.CAMERAS:
-        without, _, true = (records[f"{camera}, {arm}"] for arm in study.ARMS)
+        without, _, true = (records[f"{camera}, {arm}"] for arm in study.LOSSES)
         assert true["flow"] < without["flow"] and true["path"] < without["path"]
     assert "| still, no flow loss" in capsys.readouterr().out
 

@@ -1,4 +1,4 @@
-"""Lucas-Kanade: a smooth warp moves the Gaussians, and its flow is held to that of the photographs.
+"""Lucas-Kanade: a warp moves the Gaussians, and its flow is held to the photographs'.
 
 This follows Gaussian Splatting Lucas-Kanade, 2024, arXiv 2407.11309. The Gaussians are those of time 0; at time t
 
@@ -35,7 +35,7 @@ motion, and the rotation of spherical harmonics with their Gaussian.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.lucas_kanade.method import LUCAS_KANADE, WARPED
 from minisplat_ref.extensions.lucas_kanade.stages import stages
-from minisplat_ref.studies.study import OUT, declare, iterations, seeds
+from minisplat_ref.studies.study import CONTINUES, RESUMED_OUT, SEEDS, declare, iterations, seeds
 
 FORMS = declare(
     "forms",
@@ -47,7 +47,8 @@ BODY = declare(
     "body",
     "a turning, growing body with and without the flow loss",
     f"{__name__}.study.run_body",
-    *(OUT, iterations(2000), seeds(3)),
+    *(RESUMED_OUT, iterations(2000), SEEDS),
+    description=CONTINUES,
 )
 EXTENSION = Extension(
     "lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages, studies=(FORMS, BODY)

@@ -40,7 +40,7 @@ DIFFERENCE = 1e-5  # of central differences, in units of length and time
 ALPHA_MIN = 0.5  # of a pixel that shows the body
 TIMES = np.linspace(0, 1, 5)  # at which centres are compared
 CAMERAS = {"still": 0.0, "slow": ARC}
-ARMS = ("no flow loss", "flow of the photographs", "true flow")
+LOSSES = ("no flow loss", "flow of the photographs", "true flow")
 MEASURES = {
     "psnr": ("held-out PSNR dB", 2),
     "flow": ("flow error px", 3),
@@ -116,38 +116,48 @@ def fit(body: Body, rng: np.random.Generator) -> Warp:
 
 def run_body(args: argparse.Namespace) -> kit.Report:
     """Train the arms, and draw how far centres are from their paths."""
-    records: list[dict[str, Any]] = []
-    drawn: dict[tuple[str, str], Floats] = {}
-    jobs = [(camera, arm, seed) for seed in range(args.seeds) for camera in CAMERAS for arm in ARMS]
-    for camera, arm, seed in kit.with_progress(jobs, "trainings"):
-        body = make_body(np.random.default_rng(seed))
-        scene = film(body, CAMERAS[camera])
-        model = trained(scene, body, arm, args.iterations, seed)
-        settings = RenderSettings(scene.background, renderer=find_recipe("lucas-kanade").renderer, backend=CPU)
-        path = path_errors(model, body, CAMERAS[camera])
-        records.append(
-            {
-                "arm": f"{camera}, {arm}",
-                "seed": seed,
-                "psnr": evaluate(model, scene.test_views, settings).psnr,
-                "flow": flow_error(model, scene, body),
-                "path": float(np.mean(path[0])),
-                "path_3d": 100 * float(np.mean(path[1])),
-                "photographed_flow": photographed_flow_error(scene, body),
-            }
-        )
-        drawn[camera, arm] = path[0]
-    result = {**kit.settings_of(args, "seeds", "iterations"), **kit.describe_scene(scene), "records": records}
-    text = f"{kit.title(result)}\n\n{table(records)}"
-    return kit.Report(result, draw(drawn), text, kit.arms_of(records, "arm", tuple(MEASURES)))
+    scene = film(make_body(np.random.default_rng(0)), 0.0)
+    settings = {**kit.settings_of(args, "iterations"), **kit.describe_scene(scene)}
+    jobs = [
+        {"arm": f"{camera}, {loss}", "camera": camera, "loss": loss, "seed": seed}
+        for seed in args.seeds
+        for camera in CAMERAS
+        for loss in LOSSES
+    ]
+
+    def measure(arm: str, camera: str, loss: str, seed: int) -> list[dict[str, Any]]:
+        return [outcome(CAMERAS[camera], loss, args.iterations, seed)]
+
+    found = kit.resume(args.out, settings, jobs, measure)
+    records = [next(record for record in found if job.items() <= record.items()) for job in jobs]
+    text = f"{kit.title(settings)}; {kit.seeds_of(args)}\n\n{table(records)}"
+    result = {**settings, "seeds": list(args.seeds), "records": records}
+    return kit.Report(result, draw(records), text, kit.arms_of(records, "arm", tuple(MEASURES)))
 
 
-def trained(scene: Scene, body: Body, arm: str, iterations: int, seed: int) -> Model:
+def outcome(arc: float, loss: str, iterations: int, seed: int) -> dict[str, Any]:
+    """Return the errors of a training, for a camera that moves by an angle."""
+    body = make_body(np.random.default_rng(seed))
+    scene = film(body, arc)
+    model = trained(scene, body, loss, iterations, seed)
+    settings = RenderSettings(scene.background, renderer=find_recipe("lucas-kanade").renderer, backend=CPU)
+    paths, paths_3d = path_errors(model, body, arc)
+    return {
+        "psnr": evaluate(model, scene.test_views, settings).psnr,
+        "flow": flow_error(model, scene, body),
+        "path": float(np.mean(paths)),
+        "path_3d": 100 * float(np.mean(paths_3d)),
+        "paths": paths.tolist(),
+        "photographed_flow": photographed_flow_error(scene, body),
+    }
+
+
+def trained(scene: Scene, body: Body, loss: str, iterations: int, seed: int) -> Model:
     """Return the model of a training with one flow loss, or none."""
     recipe = find_recipe("lucas-kanade", iterations)._replace(events=(), sh_degree=0)
-    if arm == ARMS[0]:
+    if loss == LOSSES[0]:
         return kit.train_with_progress(scene, configure(recipe, flow=0.0), seed, backend=CPU).model
-    if arm == ARMS[1]:
+    if loss == LOSSES[1]:
         return kit.train_with_progress(scene, recipe, seed, backend=CPU).model
     with TemporaryDirectory() as folder:
         for view in scene.train_views:
@@ -221,19 +231,20 @@ def table(records: list[dict[str, Any]]) -> str:
         own = [record for record in records if record["arm"] == arm]
         rows.append([arm, *(with_deviation([r[name] for r in own], digits) for name, (_, digits) in MEASURES.items())])
     found = [
-        f"{camera} {with_deviation([r['photographed_flow'] for r in records if r['arm'] == f'{camera}, {ARMS[1]}'], 3)}"
+        f"{camera} {with_deviation([r['photographed_flow'] for r in records if r['camera'] == camera], 3)}"
         for camera in CAMERAS
     ]
     heading = ["camera, arm", *(label for label, _ in MEASURES.values())]
     return f"{markdown_table(heading, rows)}\n\nerror of the photographs' flow, px: {', '.join(found)}"
 
 
-def draw(paths: dict[tuple[str, str], Floats]) -> Figure:
-    """Draw the errors of the paths over time."""
+def draw(records: list[dict[str, Any]]) -> Figure:
+    """Draw the errors of the paths over time, means over the seeds."""
     figure = Figure(figsize=(7, 3), layout="constrained")
     for ax, camera in zip(figure.subplots(1, len(CAMERAS), sharey=True), CAMERAS, strict=True):
-        for arm in ARMS:
-            ax.plot(TIMES, paths[camera, arm], marker="o", label=arm)
+        for loss in LOSSES:
+            paths = [record["paths"] for record in records if record["arm"] == f"{camera}, {loss}"]
+            ax.plot(TIMES, np.mean(paths, axis=0), marker="o", label=loss)
         ax.set(title=f"{camera} camera", xlabel="time", ylim=(0, None))
     ax.legend()
     figure.axes[0].set_ylabel("error of the centres, pixels")
