@@ -1,4 +1,4 @@
-"""Lucas-Kanade: a warp moves the Gaussians, and its flow is held to the photographs'.
+"""Lucas-Kanade: a warp moves the Gaussians, and its flow is held to that of photographs.
 
 This follows Gaussian Splatting Lucas-Kanade, 2024, arXiv 2407.11309. The Gaussians are those of time 0; at time t
 
@@ -48,7 +48,7 @@ BODY = declare(
     "a turning, growing body with and without the flow loss",
     f"{__name__}.study.run_body",
     *(RESUMED_OUT, iterations(2000), SEEDS),
-    description=CONTINUES,
+    description=f"A body that turns and grows, with and without the flow loss. {CONTINUES}",
 )
 EXTENSION = Extension(
     "lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages, studies=(FORMS, BODY)
