@@ -61,7 +61,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder, PLY or compact file")
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
-    parser.add_argument("--time", type=_moment, metavar="T", help="render every image at time T (default: its camera's)")
+    parser.add_argument(
+        "--time", type=_moment, metavar="T", help="render every image at time T (default: its camera's)"
+    )
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
     parser.add_argument(
         "--map", choices=MAPS, metavar="MAP", help="also NAME_MAP.png: albedo, metallic, roughness, normal"

@@ -15,7 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.lucas_kanade import body as bodies
-from minisplat_ref.extensions.lucas_kanade import study
+from minisplat_ref.extensions.lucas_kanade import pyramid, study
 from minisplat_ref.extensions.lucas_kanade.losses import depth_order, flow, next_view, ordered_pairs, rendered_flow
 from minisplat_ref.extensions.lucas_kanade.method import WARPED, first_warp
 from minisplat_ref.extensions.lucas_kanade.moving import CENTERS, GROWTHS, LOG_WIDTH, SHIFTS, TURNS, moved
@@ -172,6 +172,22 @@ def test_flow_of_a_shift(texture, motion):
     assert np.quantile(np.abs(found.motion - motion)[inside & found.is_known], 0.95) < FLOW_OF_A_SHIFT
     if motion[0] > 1:
         assert not found.is_known[:, -4:].any()  # these leave the image
+
+
+def test_what_leaves_the_image_has_no_flow(texture, monkeypatch):
+    """Even where the flow back is not asked for."""
+    monkeypatch.setattr(pyramid, "RETURN_MAX", np.inf)
+    second = shift(texture, (0, 4, 0), order=3, mode="nearest")
+    is_known = optical_flow(texture, second).is_known
+    assert not is_known[10:-10, -3:].any() and is_known[10:-10, 10:-10].all()
+
+
+def test_a_flow_of_half_the_size_is_doubled():
+    """Every second pixel was kept: those between lie between, and a pixel there is two here."""
+    coarse = np.stack([np.arange(4.0)[None, :] + np.zeros((3, 1)), np.ones((3, 4))], axis=2)
+    fine = pyramid._enlarged(coarse, (6, 8))
+    assert_array_equal(fine[2, :, 0], [0, 1, 2, 3, 4, 5, 6, 6])
+    assert_array_equal(fine[..., 1], np.full((6, 8), 2.0))
 
 
 def test_flow_of_nothing(texture):
