@@ -220,7 +220,8 @@ def test_flow_of_a_camera():
     motion, alpha, _ = rendered_flow(model, view_from(camera), view_from(other, time=1.0), Request(backend=REFERENCE))
     assert_allclose(motion, alpha[..., None] * [-0.5, 0.0], atol=1e-10)
     behind = camera._replace(cam_from_world_t=camera.cam_from_world_t - [0, 0, 9])
-    motion, _, _ = rendered_flow(model, view_from(camera), view_from(behind, time=1.0), Request(backend=REFERENCE))
+    aside = model._replace(gaussians=model.gaussians._replace(means=np.array([[0.3, 0, 4.0]])))
+    motion, _, _ = rendered_flow(aside, view_from(camera), view_from(behind, time=1.0), Request(backend=REFERENCE))
     assert not motion.any()  # the second camera has passed it
 
 
