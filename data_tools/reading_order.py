@@ -160,6 +160,11 @@ ORDER = (
                 (22,),
                 "materials blended, then shaded per pixel in an environment that is learned; opacity from distances",
             ),
+            Step(
+                ("mechanisms/motion/", "extensions/lucas_kanade/"),
+                (),
+                "a warp that moves a scene, three forms of its velocity, and flow from photographs",
+            ),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),
     ),

@@ -61,6 +61,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder, PLY or compact file")
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
+    parser.add_argument(
+        "--time", type=_moment, metavar="T", help="render every image at time T (default: its camera's)"
+    )
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
     parser.add_argument(
         "--map", choices=MAPS, metavar="MAP", help="also NAME_MAP.png: albedo, metallic, roughness, normal"
@@ -115,7 +118,10 @@ def run(args: argparse.Namespace) -> int:
     names = file_names([view.name for view in views])
     wants = frozenset({"depth"} if args.depth else ()) | frozenset({args.map} if args.map else ())
     channels = _channels(args, source, wants)
-    outputs = (source.trained.render(view_from(view.camera, time=view.time), wants) for view in views)
+    outputs = (
+        source.trained.render(view_from(view.camera, time=view.time if args.time is None else args.time), wants)
+        for view in views
+    )
     first = next(outputs)  # what cannot be drawn is refused before the folder is touched
     _make_room(out, names)
     drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views), unit="view", disable=None)
@@ -256,6 +262,16 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
     if not views:
         raise InputError(f"{args.input} has no {which} views: give --cameras train, orbit or a JSON file")
     return views
+
+
+def _moment(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time, a finite number")
+    return value
 
 
 def _arc(text: str) -> float:

@@ -509,6 +509,21 @@ TABLES["discretized-sdf"] = {
     ),
 }
 
+TABLES["lucas-kanade"] = GS_ACCEL | rows(
+    f"{OURS}: no released value was found",
+    flow=(5.0, 1),
+    flow__flows="",
+    depth_order=(0.0, 1),
+    depth_order__depths="",
+    depth_order__margin=0.01,
+    rate__warp_centers=(1.6e-4, 1.6e-6, 30_000),
+    rate__warp_log_width=(1e-3, 1e-5, 30_000),
+    rate__warp_shifts=(1e-3, 1e-5, 30_000),
+    rate__warp_turns=(2e-3, 2e-5, 30_000),
+    rate__warp_growths=(1e-3, 1e-5, 30_000),
+    per_extent=["means", "warp_centers", "warp_shifts"],
+)
+
 CONSTANTS = [
     ("antialiasing.method", "EPS2D", 0.1, "Mip-Splatting, released code"),
     ("analytic.reference", "LINEAR", 1.6, "Analytic-Splatting, its logistic curve"),
@@ -528,6 +543,9 @@ CONSTANTS = [
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
+    ("lucas_kanade.pyramid", "WINDOW", 2.0, f"{OURS}: pixels"),
+    ("lucas_kanade.reference", "SOFT", 0.1, f"{OURS}: pixels, what the flow of photographs is right within"),
+    ("mechanisms.motion.field", "WIDTH", 2.0, f"{OURS}: spacings of the centres"),
     ("mechanisms.gbuffer.population", "ROWS", 32, f"{OURS}: a texel of 5.6 degrees"),
     ("mechanisms.surfels.losses", "NEAR", 0.2, "2DGS, released code"),
     ("mechanisms.surfels.losses", "FAR", 100.0, "2DGS, released code"),
