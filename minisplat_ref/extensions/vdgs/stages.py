@@ -1,0 +1,77 @@
+"""What the gradient check looks at: the renderer in four modes, with a small network and a small table.
+
+ReLUs, the faces of the grid's cells and the bounds of opacity are kinks, whose sides are part of a point. The two
+modes that are not here are parts of those that change both.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.extensions.vdgs import modes
+from minisplat_ref.extensions.vdgs.method import (
+    CENTER,
+    NAME,
+    RADIUS,
+    TABLE,
+    VIEW_DEPENDENT,
+    as_seen,
+    levels_of,
+    n_outputs,
+    render,
+)
+from minisplat_ref.mechanisms.networks.contraction import contract
+from minisplat_ref.mechanisms.networks.mlp import make_network, to_shared
+from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.oracle.setting import POSE, Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.types import Floats, Gaussians, Model
+
+HIDDEN, N_LEVELS, N_ROWS = 3, 2, 8
+MODES = (modes.opacity_times, modes.colors_plus, modes.both_times, modes.both_plus)
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return one stage for each mode; the first replaces that of the renderer as a whole."""
+    return tuple(_stage(backend, setting, modulation, rng) for modulation in MODES)
+
+
+def small_shared(modulation: Callable[[], modes.Mode], n_colors: int, rng: np.random.Generator) -> dict[str, Floats]:
+    """Return a network and a table of which every number can be checked."""
+    mode = modulation()
+    n = mode.opacity + n_colors * mode.colors
+    network = make_network((3 + N_LEVELS, HIDDEN, min(n, n_outputs(mode))), rng)
+    shared = {name: 0.3 * array for name, array in to_shared(NAME, network).items()}
+    table = rng.normal(size=(N_LEVELS, N_ROWS, 1))
+    return {**shared, TABLE: table, CENTER: np.zeros(3), RADIUS: np.array([2.0])}
+
+
+def _stage(backend: Backend, setting: Setting, modulation: Callable[[], modes.Mode], rng: np.random.Generator) -> Stage:
+    shared = small_shared(modulation, 3 * (1 + setting.gaussians.sh_rest.shape[1]), rng)
+    is_first = modulation is MODES[0]
+    representation = VIEW_DEPENDENT._replace(
+        name=VIEW_DEPENDENT.name if is_first else f"{VIEW_DEPENDENT.name}, {modulation.__name__}",
+        shared=lambda scene, rng: shared,
+        renderer=VIEW_DEPENDENT.renderer._replace(render=partial(render, modulation=modulation)),
+    )
+    stage = model_stage(backend, setting, representation, rng)
+
+    def function(*args: Floats) -> Point:
+        by_name = {CENTER: shared[CENTER], RADIUS: shared[RADIUS], **dict(zip(stage.inputs, args, strict=True))}
+        R, t = (by_name[name] for name in POSE)
+        camera = setting.camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+        model = Model(
+            Gaussians(*(by_name[name] for name in Gaussians._fields)), {name: by_name[name] for name in shared}
+        )
+        _, tape = as_seen(model, camera, modulation(), IN_NUMPY)
+        places = (contract((model.gaussians.means - by_name[CENTER]) / by_name[RADIUS]) + 2) / 4
+        cells = [np.floor(places * n) for n in levels_of(by_name[TABLE]).resolutions]
+        bounds = () if tape.opacities is None else (tape.opacities.is_free,)
+        point = stage.function(*args)
+        return point._replace(sides=(*point.sides, tape.inputs[1] > 0, *cells, *bounds))
+
+    return stage._replace(function=function)
