@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.types import Gaussians, Model
 
 
 def add_parser(commands: Any) -> None:
@@ -26,33 +27,33 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        It is no run of this extension, or has no such view; a file alone has no network.
+        It is no run of this recipe that has ended, or has no such view; a file alone has no network.
     """
-    from minisplat_ref.extensions.extension import load_extension, owner_of
-    from minisplat_ref.extensions.vdgs.method import VIEW_DEPENDENT, as_seen
+    from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT, as_seen
+    from minisplat_ref.extensions.vdgs.modes import opacity_times
     from minisplat_ref.io import viewpoints
-    from minisplat_ref.io.frames import place_camera
-    from minisplat_ref.io.ply import save_ply
+    from minisplat_ref.io.checkpoint import load_checkpoint
+    from minisplat_ref.io.frames import place_camera, return_fields
+    from minisplat_ref.io.ply import read_label, save_ply
     from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-    from minisplat_ref.runs import settings as run_settings
-    from minisplat_ref.runs.checkpoints import newest_model
-    from minisplat_ref.runs.run_folder import CAMERAS
+    from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
+    from minisplat_ref.training.schedule import alternatives_of
 
-    if not args.run_folder.is_dir():
-        raise InputError(f"{args.run_folder} is no folder: give the run, a PLY alone has no network to evaluate")
-    settings = run_settings.load(args.run_folder)
-    owner = owner_of(settings.recipe, settings.extension)
-    if owner is None or owner.name != "vdgs":
-        raise InputError(f"{args.run_folder} has no network: train it with --recipe vdgs")
-    cameras = {view.name: view.camera for view in viewpoints.read(args.run_folder / CAMERAS)}
+    folder, checkpoint = args.run_folder, args.run_folder / "checkpoint.npz"
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder: give that of the run, a PLY alone has no network to evaluate")
+    arrays, metadata = load_checkpoint(checkpoint)
+    recipe, _ = written_by(metadata)
+    if recipe != VDGS.name:
+        raise InputError(f"{folder} was trained by recipe {recipe}, without a network: train with --recipe {VDGS.name}")
+    cameras = {view.name: view.camera for view in viewpoints.read(folder / "cameras.json")}
     if args.view not in cameras:
-        raise InputError(f"{args.run_folder} has no view {args.view}: choose from {', '.join(sorted(cameras))}")
-    frame = run_settings.load_frame(args.run_folder)
-    modulation = run_settings.recipe_of(settings).representation.renderer.render.keywords["modulation"]
-    model = newest_model(args.run_folder, settings).model
+        raise InputError(f"{folder} has no view {args.view}: choose from {', '.join(sorted(cameras))}")
+    bundles, frame = read_bundles(checkpoint, arrays, Gaussians), read_frame(checkpoint, metadata)
+    chosen = dict(setting.split("=", 1) for setting in read_label(folder / "point_cloud.ply").set)
+    modulation = alternatives_of(opacity_times)[chosen.get("modulation", opacity_times.__name__)]
+    model = Model(bundles.gaussians, bundles.shared)
     seen, _ = as_seen(model, place_camera(cameras[args.view], frame), modulation(), IN_NUMPY)
-    extension = load_extension("vdgs")._replace(representation=VIEW_DEPENDENT)
-    returned = run_settings.return_model(model._replace(gaussians=seen), extension, frame)
-    save_ply(args.out, returned.gaussians)
+    save_ply(args.out, Gaussians(**return_fields(seen._asdict(), VIEW_DEPENDENT.units, frame)))
     print(f"{len(seen.means):,} Gaussians as view {args.view} sees them in {args.out}; other views see others")
     return 0

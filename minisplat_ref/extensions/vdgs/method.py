@@ -180,7 +180,7 @@ VIEW_DEPENDENT = Representation(
             TABLE: LogLinear(1e-2, 1e-3, 30_000),
             CENTER: 0.0,
             RADIUS: 0.0,
-            **network_rates(NAME, 2, LogLinear(1e-3, 1e-4, 30_000)),
+            **network_rates(NAME, 2, LogLinear(5e-3, 5e-4, 30_000)),
         },
         frozenset(),
     ),

@@ -7,12 +7,11 @@ Gaussian of the pane has the opacity of Schlick's approximation of Fresnel's ref
 
 with an F_0 above that of glass, so that the pane is seen from the front, too. Trainings begin with this scene, but
 with one opacity of the pane for all views, and keep their number of Gaussians. They compare harmonics alone with the
-network in the two modes of opacity, and with harmonics that have more Gaussians: as many as have no fewer floats than
-Gaussians and network together. The further ones are copies, a little moved, that share the opacity of the first.
+network in the two modes of opacity. Errors of opacity are over views that were held out, and over the Gaussians of the
+pane.
 
-The start is favourable, and the further Gaussians have little to explain in so small a scene; ``docs/FAMILY.md`` says
-how the same comparison goes in scenes of photographs. Errors of opacity are over views that were held out, and over
-the Gaussians of the pane; of copies, the opacity that they have together counts.
+The start is favourable, and the network has many more floats than these few Gaussians: :mod:`.floats_study` compares at
+equal floats.
 """
 
 import argparse
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic.cameras import look_at
@@ -29,10 +29,9 @@ from minisplat_ref.extensions.vdgs.reference import directions
 from minisplat_ref.mechanisms.networks.networks import COMPILED
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
+from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, RED
-from minisplat_ref.strategy.ops import concat
+from minisplat_ref.reports.palette import BLUE, OCHRE, RED
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import summarise, with_deviation
 from minisplat_ref.training.initial_state import initial_state
@@ -47,8 +46,8 @@ ANGLE_MAX = np.radians(80)
 SIDE = 5  # Gaussians along each side of the pane, which comes first in the population
 F0 = 0.2
 NORMAL = np.array([0.0, -1.0, 0.0])
-HARMONICS, TIMES, PLUS, MORE = "harmonics", "opacity_times", "opacity_plus", "harmonics, equal floats"
-COLORS = {HARMONICS: BLUE, MORE: GREEN, TIMES: RED, PLUS: OCHRE}
+HARMONICS, TIMES, PLUS = "harmonics", "opacity_times", "opacity_plus"
+COLORS = {HARMONICS: BLUE, TIMES: RED, PLUS: OCHRE}
 
 
 def schlick(cosines: Floats, f0: float = F0) -> Floats:
@@ -68,7 +67,7 @@ def make_pane(rng: np.random.Generator) -> Gaussians:
     found = Gaussians(
         means=np.concatenate([pane, wall]),
         quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        log_scales=np.log(np.concatenate([np.tile(0.13 * thin, (len(pane), 1)), np.tile(0.3 * thin, (len(wall), 1))])),
+        log_scales=np.log(np.concatenate([np.tile(0.2 * thin, (len(pane), 1)), np.tile(0.3 * thin, (len(wall), 1))])),
         opacity_logits=np.concatenate([np.zeros(len(pane)), np.full(len(wall), 3.0)]),
         sh_dc=colors,
         sh_rest=np.zeros((n, 15, 3)),
@@ -82,7 +81,7 @@ def true_opacities(gaussians: Gaussians, camera: Camera) -> Floats:
     return schlick(np.abs(d @ NORMAL))
 
 
-def photograph(gaussians: Gaussians, camera: Camera) -> Floats:
+def photograph(gaussians: Gaussians, camera: Camera) -> NDArray[np.uint8]:
     """Return the 8-bit image of the scene, whose pane has the opacities of the view."""
     o = true_opacities(gaussians, camera)
     logits = np.concatenate([np.log(o / (1 - o)), gaussians.opacity_logits[SIDE**2 :]]).astype(np.float32)
@@ -115,7 +114,6 @@ def arms(iterations: int) -> dict[str, Recipe]:
     ours = VDGS._replace(representation=VIEW_DEPENDENT)
     recipes = {
         HARMONICS: GS_ACCEL,
-        MORE: GS_ACCEL,
         TIMES: ours,
         PLUS: configure(ours, modulation=modes.opacity_plus),
     }
@@ -127,55 +125,32 @@ def floats_of(model: Model) -> int:
     return len(model.gaussians.means) * kit.floats_of(model.gaussians) + sum(a.size for a in model.shared.values())
 
 
-def copies(start: Gaussians, n_floats: int, rng: np.random.Generator) -> Gaussians:
-    """Return Gaussians and as many copies of all of them as give at least ``n_floats``, each a little moved.
-
-    The c copies of a Gaussian have the opacity ``1 - (1 - o)^(1/c)``, so that together they hide what one did.
-    """
-    c = -(-n_floats // (len(start.means) * kit.floats_of(start)))
-    o = 1 - (1 + np.exp(start.opacity_logits.astype(np.float64))) ** (-1 / c)
-    start = start._replace(opacity_logits=np.log(o / (1 - o)).astype(np.float32))
-    moved = [start._replace(means=start.means + _noise(start.means, rng)) for _ in range(c - 1)]
-    found = start
-    for each in moved:
-        found = concat(found, each)
-    return found
-
-
-def _noise(means: Floats, rng: np.random.Generator) -> Floats:
-    return (0.05 * rng.normal(size=means.shape)).astype(np.float32)
-
-
-def pane_opacities(model: Model, recipe: Recipe, camera: Camera, n_base: int) -> Floats:
-    """Return the opacities [SIDE^2] of the pane in a view: what copies hide together."""
+def pane_opacities(model: Model, recipe: Recipe, camera: Camera) -> Floats:
+    """Return the opacities [SIDE^2] of the pane in a view."""
     seen = model.gaussians
     if model.shared:
         mode = recipe.renderer.render.keywords["modulation"]()  # type: ignore[attr-defined]
         seen, _ = as_seen(model, camera, mode, COMPILED)
-    transparencies = 1 / (1 + np.exp(seen.opacity_logits.astype(np.float64))).reshape(-1, n_base)
-    return 1 - np.prod(transparencies[:, : SIDE**2], axis=0)
+    opacities: Floats = activate(seen).opacities[: SIDE**2]
+    return opacities
 
 
 def measure(seed: int, iterations: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Train every arm; return their records, and by arm the angles and opacities at the views that were held out."""
     rng = np.random.default_rng(seed)
     truth = make_pane(rng)
-    scene, n = make_pane_scene(truth), len(truth.means)
+    scene = make_pane_scene(truth)
     start = truth._replace(opacity_logits=truth.opacity_logits.copy())
     start.opacity_logits[: SIDE**2] = np.log(F0 / (1 - F0))
-    records, curves = [], {}
-    n_floats = 0
-    recipes = arms(iterations)
-    for name in (TIMES, PLUS, HARMONICS, MORE):
-        recipe = recipes[name]
+    records: list[dict[str, Any]] = []
+    curves: dict[str, Any] = {}
+    for name, recipe in arms(iterations).items():
         state = initial_state(scene, recipe, seed)
-        begun = copies(start, n_floats, rng) if name == MORE else start
-        state = state_with(state, begun)
-        n_floats = max(n_floats, floats_of(state.model))
+        state.gaussians = Gaussians(*(field.copy() for field in start))
         train(scene, recipe, seed=seed, state=state, backend=CPU)
         shown = RenderSettings(scene.background, renderer=recipe.renderer, backend=CPU)
         cameras = [view.camera for view in scene.test_views]
-        found = np.array([pane_opacities(state.model, recipe, camera, n) for camera in cameras])
+        found = np.array([pane_opacities(state.model, recipe, camera) for camera in cameras])
         true = np.array([true_opacities(truth, camera) for camera in cameras])
         records.append(
             {
@@ -183,7 +158,7 @@ def measure(seed: int, iterations: int) -> tuple[list[dict[str, Any]], dict[str,
                 "seed": seed,
                 "psnr": evaluate(state.model, scene.test_views, shown).psnr,
                 "opacity_rmse": float(np.sqrt(np.mean((found - true) ** 2))),
-                "gaussians": len(begun.means),
+                "gaussians": len(start.means),
                 "floats": floats_of(state.model),
             }
         )
@@ -193,18 +168,10 @@ def measure(seed: int, iterations: int) -> tuple[list[dict[str, Any]], dict[str,
     return records, curves
 
 
-def state_with(state: Any, gaussians: Gaussians) -> Any:
-    """Return the state of a training that begins with other Gaussians."""
-    from minisplat_ref.training.adam import zero_moments
-
-    state.gaussians = Gaussians(*(np.ascontiguousarray(field).copy() for field in gaussians))
-    state.adam = zero_moments(state.gaussians)
-    return state
-
-
 def run(args: argparse.Namespace) -> kit.Report:
     """Train all arms for every seed."""
-    records, curves = [], {}
+    records: list[dict[str, Any]] = []
+    curves: dict[str, Any] = {}
     for seed in kit.with_progress(range(args.seeds), "seeds"):
         found, curves = measure(seed, args.iterations)
         records += found
@@ -223,12 +190,11 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 def draw(curves: dict[str, Any]) -> Figure:
     """Plot the opacities of the last seed over the angle, beside Schlick's formula."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(COLORS), sharey=True)
     line = np.linspace(0, 85, 100)
-    for ax, names in zip(axes, ((HARMONICS, MORE), (TIMES, PLUS)), strict=True):
-        for name in names:
-            ax.plot(curves["angles"].ravel(), curves[name].ravel(), ".", ms=3, color=COLORS[name], label=name)
+    for ax, (name, color) in zip(axes, COLORS.items(), strict=True):
+        ax.plot(curves["angles"].ravel(), curves[name].ravel(), ".", ms=3, color=color, label=name)
         ax.plot(line, schlick(np.cos(np.radians(line))), "k", lw=1, label="Schlick")
         ax.set(xlabel="angle from the normal (degrees)", ylim=(0, 1))
         ax.legend(loc="upper left")
