@@ -153,6 +153,11 @@ ORDER = (
                 (),
                 "materials blended, then shaded per pixel in an environment that is learned; opacity from distances",
             ),
+            Step(
+                ("mechanisms/networks/", "extensions/vdgs/"),
+                (),
+                "small networks trained with a scene: opacities that depend on the view",
+            ),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),
     ),
