@@ -80,7 +80,8 @@ def test_a_mode_says_how_many_outputs_there_are():
 @pytest.mark.parametrize("modulation", ALL_MODES, ids=lambda mode: mode.__name__)
 def test_outputs_arrive_where_they_belong(modulation, rng):
     """A network without weights has its biases as outputs: 0.01 for the first, 0.02 for the second, and so on."""
-    g, mode = make_gaussians(rng, 4, sh_degree=1), modulation()
+    g, name, mode = make_gaussians(rng, 4, sh_degree=1), modulation.__name__, modulation()
+    assert mode == (not name.startswith("colors"), not name.startswith("opacity"), name.endswith("plus"))
     shared = small_shared(modulation, 12, rng)
     shared = {name: 0 * array if "weights" in name else array for name, array in shared.items()}
     y = 0.01 * np.arange(1, 1 + mode.opacity + 12 * mode.colors)
