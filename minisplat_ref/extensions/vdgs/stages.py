@@ -5,7 +5,7 @@ modes that are not here are parts of those that change both.
 """
 
 from collections.abc import Callable
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from minisplat_ref.extensions.vdgs.method import (
     RADIUS,
     TABLE,
     VIEW_DEPENDENT,
+    Tape,
     as_seen,
     levels_of,
     n_outputs,
@@ -27,11 +28,12 @@ from minisplat_ref.mechanisms.networks.mlp import make_network, to_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
-from minisplat_ref.oracle.setting import POSE, Setting
+from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
-from minisplat_ref.types import Floats, Gaussians, Model
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Floats, Model, RenderOutput, View
 
-HIDDEN, N_LEVELS, N_ROWS = 3, 2, 8
+HIDDEN, N_LEVELS, N_ROWS = 3, 1, 8  # one coarse level: between many faces, steps are so small that they round
 MODES = (modes.opacity_times, modes.colors_plus, modes.both_times, modes.both_plus)
 
 
@@ -53,25 +55,33 @@ def small_shared(modulation: Callable[[], modes.Mode], n_colors: int, rng: np.ra
 def _stage(backend: Backend, setting: Setting, modulation: Callable[[], modes.Mode], rng: np.random.Generator) -> Stage:
     shared = small_shared(modulation, 3 * (1 + setting.gaussians.sh_rest.shape[1]), rng)
     is_first = modulation is MODES[0]
+    recorded: list[tuple[Any, ...]] = []
+
+    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+        output, tapes = render(model, view, request, modulation=modulation)
+        assert tapes[1] is not None
+        recorded[:] = [_sides(tapes[1])]
+        return output, tapes
+
     representation = VIEW_DEPENDENT._replace(
         name=VIEW_DEPENDENT.name if is_first else f"{VIEW_DEPENDENT.name}, {modulation.__name__}",
         shared=lambda scene, rng: shared,
-        renderer=VIEW_DEPENDENT.renderer._replace(render=partial(render, modulation=modulation)),
+        renderer=VIEW_DEPENDENT.renderer._replace(render=watched),
     )
     stage = model_stage(backend, setting, representation, rng)
 
     def function(*args: Floats) -> Point:
-        by_name = {CENTER: shared[CENTER], RADIUS: shared[RADIUS], **dict(zip(stage.inputs, args, strict=True))}
-        R, t = (by_name[name] for name in POSE)
-        camera = setting.camera._replace(cam_from_world_R=R, cam_from_world_t=t)
-        model = Model(
-            Gaussians(*(by_name[name] for name in Gaussians._fields)), {name: by_name[name] for name in shared}
-        )
-        _, tape = as_seen(model, camera, modulation(), IN_NUMPY)
-        places = (contract((model.gaussians.means - by_name[CENTER]) / by_name[RADIUS]) + 2) / 4
-        cells = [np.floor(places * n) for n in levels_of(by_name[TABLE]).resolutions]
-        bounds = () if tape.opacities is None else (tape.opacities.is_free,)
         point = stage.function(*args)
-        return point._replace(sides=(*point.sides, tape.inputs[1] > 0, *cells, *bounds))
+        return point._replace(sides=(*point.sides, *recorded[0]))
 
     return stage._replace(function=function)
+
+
+def _sides(tape: Tape) -> tuple[Any, ...]:
+    """Return the ReLUs that are on, the cells of the grid, and which opacities are at no bound."""
+    means, shared = tape.model.gaussians.means, tape.model.shared
+    places = (contract((means - shared[CENTER]) / shared[RADIUS]) + 2) / 4
+    cells = [np.floor(places * n) for n in levels_of(shared[TABLE]).resolutions]
+    bounds = () if tape.opacities is None else (tape.opacities.is_free,)
+    hidden = as_seen(tape.model, tape.camera, tape.mode, IN_NUMPY)[1].inputs[1]  # kernels keep them otherwise
+    return (hidden > 0, *cells, *bounds)
