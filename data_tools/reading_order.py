@@ -165,6 +165,11 @@ ORDER = (
                 (),
                 "a warp that moves a scene, three forms of its velocity, and flow from photographs",
             ),
+            Step(
+                ("mechanisms/networks/", "extensions/vdgs/"),
+                (),
+                "small networks trained with a scene: opacities that depend on the view",
+            ),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),
     ),

@@ -466,6 +466,15 @@ TABLES = {
     },
     "textured": GS_ACCEL
     | rows(f"{OURS}: between 3DGS's rates", rate__color_textures=0.000625, rate__opacity_textures=0.0125),
+    "vdgs": GS_ACCEL
+    | rows("VDGS, its default mode", render__modulation="opacity_times")
+    | rows(
+        f"{OURS}: rates of the network and of the hash grid, and the place of the scene, which is not trained",
+        **{f"rate__network_{kind}_{k}": (5e-3, 5e-4, 30_000) for kind in ("weights", "biases") for k in (0, 1)},
+        rate__hash_table=(1e-2, 1e-3, 30_000),
+        rate__place_center=0.0,
+        rate__place_radius=0.0,
+    ),
     "velocity": GS_ACCEL
     | rows(
         f"{OURS}: five times the rate of the means",
@@ -554,6 +563,9 @@ CONSTANTS = [
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
     ("wave.hologram", "PITCH", 8.0, f"{OURS}: um, of displays of phases that can be bought"),
     ("wave.hologram", "WAVELENGTHS", (638.0, 520.0, 450.0), f"{OURS}: nm, of laser diodes"),
+    ("vdgs.reference", "OPACITY_MAX", 0.99, "VDGS, the bound of opacities"),
+    ("vdgs.method", "N_LEVELS", 4, f"{OURS}: a hash grid for a CPU"),
+    ("vdgs.method", "HIDDEN", 32, f"{OURS}: a network for a CPU"),
     ("vr.foveation", "ACUITY_OFFSET", 0.02083333333, "Guenter et al. 2012"),
     ("vr.foveation", "ACUITY_SLOPE", 0.0275, "Guenter et al. 2012"),
     ("vr.queues", "SIZES", (64, 8, 4), "StopThePop, released code"),

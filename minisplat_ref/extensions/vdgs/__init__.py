@@ -1,0 +1,68 @@
+"""VDGS: a network of place and direction changes opacity, or colour.
+
+This follows VDGS, Malarz et al. 2023, arXiv 2312.13729. Spherical harmonics let a colour depend on the direction of
+view, and nothing lets an opacity. Here a small network reads the direction d from which a Gaussian is seen, and the
+multi-resolution hash encoding E of its centre, and its output y changes the opacity o, the coefficients c_k of colour,
+or both (:mod:`.method`, :mod:`.reference`):
+
+    y = MLP([d, E(mu)]),   d = (mu - camera) / |mu - camera|
+    o' = o (1 + y)  or  o + y,   c_k' = c_k (1 + y_k)  or  c_k + y_k
+
+``--set modulation=opacity_times`` is the default; ``opacity_plus``, ``colors_times`` and ``colors_plus`` are the other
+published modes, ``both_times`` and ``both_plus`` change opacity and colour (:mod:`.modes`).
+
+    minisplat-ref train SCENE --recipe vdgs --set modulation=colors_plus --out runs/glossy
+    minisplat-ref vdgs bake runs/glossy --view 0003 --out seen.ply
+    minisplat-ref study vdgs/pane --out DIR
+    minisplat-ref study vdgs/floats fox --downscale 2 --out DIR
+    minisplat-ref oracle gradients --extension vdgs
+
+A run keeps the network in ``shared.npz``. A PLY does not hold it, and says so: drawn without the run, the Gaussians are
+those of 3DGS with y = 0. ``vdgs bake`` writes what one view sees.
+
+This deviates from the paper as follows. The factor is 1 + y instead of y, and the last layer starts at 0, so that a
+training begins as 3DGS and without an output is 3DGS exactly. An opacity is kept between 1e-4 and 0.99; one above 0.99
+is not raised further. Space is contracted into the unit cube. Hash grid and network are small, for a CPU: 4 levels of
+4,096 rows with two features, 32 hidden units, and the learning rates are ours.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.vdgs import bake
+from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
+from minisplat_ref.extensions.vdgs.stages import stages
+from minisplat_ref.io.label import Label
+from minisplat_ref.io.ply import save_ply
+from minisplat_ref.studies.study import OUT, RESUMED_OUT, declare, downscale, iterations, number, scene, seeds
+
+
+def save(path: str | Path, gaussians: Any, label: Label) -> None:
+    """Write the six fields, and say in the header that the network is missing."""
+    save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
+
+
+PANE = declare(
+    "pane",
+    "a pane whose opacity follows Schlick's formula: learned against true",
+    f"{__name__}.study.run",
+    *(OUT, iterations(600), seeds(3)),
+)
+FLOATS = declare(
+    "floats",
+    "held-out PSNR of four modes with as many floats as harmonics alone",
+    f"{__name__}.floats_study.run",
+    *(scene(), RESUMED_OUT, downscale(), iterations(1000), seeds(3)),
+    number("--gaussians", 10_000, "of harmonics alone, at most one for each point"),
+)
+EXTENSION = Extension(
+    "vdgs",
+    recipes=(VDGS,),
+    representation=VIEW_DEPENDENT,
+    save=save,
+    commands=(bake,),
+    stages=stages,
+    studies=(PANE, FLOATS),
+)
+"""The recipe ``vdgs`` with its renderer, a command and studies."""

@@ -1,0 +1,190 @@
+"""The network, the renderer that asks it for every view, and the recipe.
+
+With the centre mu of a Gaussian, the direction d from which it is seen, and the hash grid E::
+
+    y = MLP([d, E(p)]),   p = (contract((mu - c) / r) + 2) / 4
+
+c is the median of the scene's points, and nine tenths of them are within r. The last layer starts at 0, so y does.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.extensions.vdgs.modes import Mode, opacity_times
+from minisplat_ref.extensions.vdgs.reference import (
+    Opacities,
+    directions,
+    directions_vjp,
+    modulate,
+    modulate_vjp,
+    modulated_logits,
+    modulated_logits_vjp,
+)
+from minisplat_ref.io.frames import Unit
+from minisplat_ref.mechanisms.networks.contraction import contract, contract_vjp
+from minisplat_ref.mechanisms.networks.hash_grid import Levels, make_levels, make_table
+from minisplat_ref.mechanisms.networks.mlp import Layer, from_shared, make_network, network_rates, to_shared
+from minisplat_ref.mechanisms.networks.networks import Networks, networks_for
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.training.rates import LogLinear, Rates
+from minisplat_ref.training.representation import WORLD_UNITS, Representation
+from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
+
+N_LEVELS, N_ROWS, N_FEATURES = 4, 2**12, 2  # of the hash grid
+COARSEST, FINEST = 16, 128  # cells along a side
+HIDDEN = 32
+N_COLORS = 48  # coefficients of degrees 0 to 3
+NAME, TABLE, CENTER, RADIUS = "network", "hash_table", "place_center", "place_radius"
+
+
+class Tape(NamedTuple):
+    """Record of a modulation, for its gradient."""
+
+    model: Model
+    mode: Mode
+    networks: Networks
+    camera: Camera
+    d: Floats
+    distances: Floats
+    y: Floats
+    """[N, outputs]."""
+    inputs: list[Floats]
+    """Of the network's layers."""
+    opacities: Opacities | None
+
+
+def n_outputs(mode: Mode) -> int:
+    """Return how many outputs a network has: one for the opacity, one for each coefficient of colour."""
+    return mode.opacity + N_COLORS * mode.colors
+
+
+def initial_shared(scene: Scene, rng: np.random.Generator, *, modulation: Callable[[], Mode]) -> Mapping[str, Floats]:
+    """Return the network, whose last layer is 0, the hash grid, and the place of the scene, float32."""
+    (rng,) = rng.spawn(1)  # so that the training draws what one of 3DGS does
+    levels = make_levels(N_LEVELS, COARSEST, FINEST, n_rows=N_ROWS, n_features=N_FEATURES)
+    network = make_network((3 + N_LEVELS * N_FEATURES, HIDDEN, n_outputs(modulation())), rng)
+    last = Layer(*(np.zeros_like(array) for array in network[-1]))
+    center, radius = np.zeros(3), scene.extent
+    if len(scene.points):
+        center = np.median(scene.points.astype(np.float64), axis=0)
+        radius = np.quantile(np.linalg.norm(scene.points - center, axis=1), 0.9) or scene.extent
+    shared = {
+        **to_shared(NAME, (*network[:-1], last)),
+        TABLE: make_table(levels, rng),
+        CENTER: center,
+        RADIUS: np.array([radius]),
+    }
+    return {name: array.astype(np.float32) for name, array in shared.items()}
+
+
+def levels_of(table: Floats) -> Levels:
+    """Return the levels of a table [L, T, F]."""
+    return make_levels(table.shape[0], COARSEST, FINEST, n_rows=table.shape[1], n_features=table.shape[2])
+
+
+def _in_dtype(shared: Mapping[str, Floats], means: Floats) -> dict[str, Floats]:
+    return {name: np.ascontiguousarray(array, means.dtype) for name, array in shared.items()}
+
+
+def as_seen(model: Model, camera: Camera, mode: Mode, networks: Networks) -> tuple[Gaussians, Tape]:
+    """Return the Gaussians of 3DGS that a camera sees, and the tape."""
+    g, shared = model.gaussians, _in_dtype(model.shared, model.gaussians.means)
+    d, distances = directions(g.means, camera)
+    places = (contract((g.means - shared[CENTER]) / shared[RADIUS]) + 2) / 4
+    encoding = networks.hash_grid(shared[TABLE], places, levels_of(shared[TABLE]))
+    y, inputs = networks.forward(from_shared(NAME, shared), np.concatenate([d, encoding], axis=1))
+    opacities, seen = None, g
+    if mode.opacity:
+        opacities = modulated_logits(g.opacity_logits, y[:, 0], mode.is_sum)
+        seen = seen._replace(opacity_logits=opacities.logits)
+    if mode.colors:
+        y_dc, y_rest = _of_colors(y, mode, g)
+        seen = seen._replace(
+            sh_dc=modulate(g.sh_dc, y_dc, mode.is_sum), sh_rest=modulate(g.sh_rest, y_rest, mode.is_sum)
+        )
+    return seen, Tape(model, mode, networks, camera, d, distances, y, inputs, opacities)
+
+
+def _of_colors(y: Floats, mode: Mode, g: Gaussians) -> tuple[Floats, Floats]:
+    """Return the outputs for the coefficients of degree 0 [N, 3] and of the others that are stored [N, K-1, 3]."""
+    n, n_rest = g.sh_rest.shape[:2]
+    first = int(mode.opacity)
+    return y[:, first : first + 3], y[:, first + 3 : first + 3 + 3 * n_rest].reshape(n, n_rest, 3)
+
+
+def as_seen_vjp(tape: Tape, v: RenderGradient) -> RenderGradient:
+    """Gradient of :func:`as_seen`, added to that of the rendering.
+
+    ::
+
+        v_y         = those of opacity and colours
+        v_[d, E]    = MLP^T v_y
+        v_mu       += directions^T v_d + contract^T (E^T v_E / 4) / r
+    """
+    g, shared, mode, y = tape.model.gaussians, _in_dtype(tape.model.shared, tape.y), tape.mode, tape.y
+    v_g, v_y = v.gaussians, np.zeros_like(y)
+    if tape.opacities is not None:
+        v_logits, v_y[:, 0] = modulated_logits_vjp(tape.opacities, y[:, 0], mode.is_sum, v_g.opacity_logits)
+        v_g = v_g._replace(opacity_logits=v_logits)
+    if mode.colors:
+        (y_dc, y_rest), (into_dc, into_rest) = _of_colors(y, mode, g), _of_colors(v_y, mode, g)
+        v_dc, v_y_dc = modulate_vjp(g.sh_dc, y_dc, mode.is_sum, v_g.sh_dc)
+        v_rest, v_y_rest = modulate_vjp(g.sh_rest, y_rest, mode.is_sum, v_g.sh_rest)
+        first, end = int(mode.opacity), int(mode.opacity) + into_dc.shape[1] + into_rest[0].size
+        v_y[:, first:end] = np.concatenate([v_y_dc, v_y_rest.reshape(len(y), -1)], axis=1)
+        v_g = v_g._replace(sh_dc=v_dc, sh_rest=v_rest)
+    v_network, v_inputs = tape.networks.forward_vjp(from_shared(NAME, shared), tape.inputs, v_y)
+    v_d, v_encoding = v_inputs[:, :3], np.ascontiguousarray(v_inputs[:, 3:])
+    scaled = (g.means - shared[CENTER]) / shared[RADIUS]
+    places = (contract(scaled) + 2) / 4
+    v_table, v_places = tape.networks.hash_grid_vjp(shared[TABLE], places, levels_of(shared[TABLE]), v_encoding)
+    v_means, v_R, v_t = directions_vjp(tape.d, tape.distances, tape.camera, v_d)
+    v_means = v_means + contract_vjp(scaled, v_places / 4) / shared[RADIUS]
+    return v._replace(
+        gaussians=v_g._replace(means=v_g.means + v_means),
+        cam_from_world_R=v.cam_from_world_R + v_R,
+        cam_from_world_t=v.cam_from_world_t + v_t,
+        shared={**v.shared, **to_shared(NAME, v_network), TABLE: v_table},
+    )
+
+
+def render(
+    model: Model, view: View, request: Request, *, modulation: Callable[[], Mode]
+) -> tuple[RenderOutput, tuple[Any, Tape | None]]:
+    """Render the Gaussians as the view's camera sees them; without a network, as in a file alone, those of 3DGS."""
+    if TABLE not in model.shared or not len(model.gaussians.means):
+        output, inner = SPLATTING.render(model, view, request)
+        return output, (inner, None)
+    seen, tape = as_seen(model, view.camera, modulation(), networks_for(request.backend))
+    output, inner = SPLATTING.render(model._replace(gaussians=seen), view, request)
+    return output, (inner, tape)
+
+
+def render_vjp(tapes: tuple[Any, Tape | None], v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+    """Gradient of :func:`render`: that of 3DGS, carried on to the network."""
+    inner, tape = tapes
+    v = SPLATTING.render_vjp(inner, v_image, v_alpha)
+    return v if tape is None else as_seen_vjp(tape, v)
+
+
+VIEW_DEPENDENT = Representation(
+    "vdgs",
+    shared=partial(initial_shared, modulation=opacity_times),
+    renderer=Renderer("vdgs", partial(render, modulation=opacity_times), render_vjp, SPLATTING.channels),
+    rates=Rates(
+        {
+            TABLE: LogLinear(1e-2, 1e-3, 30_000),
+            CENTER: 0.0,
+            RADIUS: 0.0,
+            **network_rates(NAME, 2, LogLinear(5e-3, 5e-4, 30_000)),
+        },
+        frozenset(),
+    ),
+    units={**WORLD_UNITS, CENTER: Unit.PLACE, RADIUS: Unit.LENGTH},
+)
+VDGS = GS_ACCEL._replace(name="vdgs")
+"""``vdgs``: 3DGS whose opacities, or colours, a network changes with the view."""
