@@ -28,6 +28,7 @@ HOST = "127.0.0.1"
 POLL_SECONDS = 0.02  # between looks at what browsers want
 LONGEST, LONGEST_MIN, LONGEST_MAX = 960, 160, 1920  # pixels of the longer side of a full frame
 JPEG_QUALITY = 90
+LINE_WIDTH = 1.5  # pixels, of cameras
 FILM_SECONDS = 4.0
 
 
@@ -81,8 +82,8 @@ def open_server(port: int, label: str) -> Any:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind((HOST, port))
-        except OSError as error:
-            reason = error.strerror or str(error)
+        except (OSError, OverflowError) as error:  # the latter where there is no such number
+            reason = getattr(error, "strerror", None) or "ports end at 65535"
             raise InputError(f"port {port} cannot be used ({reason}): give another one, or 0 for any") from None
         port = trial.getsockname()[1]
     with contextlib.redirect_stdout(io.StringIO()):  # a table of its own
@@ -116,7 +117,7 @@ class Viewer:
 
     def _build_panel(self, start: Pose) -> None:
         gui, content = self._server.gui, self._content
-        gui.configure_theme(control_layout="collapsible", show_share_button=False)
+        gui.configure_theme(show_logo=False, show_share_button=False)
         self._layer = gui.add_dropdown("layer", layers_of(content.trained.renderer), initial_value="colour")
         self._longest = gui.add_slider(
             "pixels", LONGEST_MIN, LONGEST_MAX, 32, LONGEST, hint="of the longer side, once the camera rests"
@@ -204,6 +205,8 @@ class Viewer:
             pose.fov,
             aspect,
             scale=scale,
+            thickness=LINE_WIDTH,
+            thickness_units="screen",
             image=images.get(view.name),
             wxyz=pose.wxyz,
             position=pose.position,

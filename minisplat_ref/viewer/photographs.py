@@ -13,7 +13,7 @@ from minisplat_ref.runs.settings import load, load_frame, load_photographs
 from minisplat_ref.types import Scene
 
 LONGEST = 160  # pixels
-SCALE = 0.15  # of the spread of the cameras: height of a camera that is shown
+SCALE = 0.05  # of the spread of the cameras: height of a camera that is shown
 
 
 def load_thumbnails(folder: Path) -> dict[str, Image8]:
