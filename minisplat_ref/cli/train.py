@@ -401,7 +401,7 @@ def _train(
     print(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
-    print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    print(f"results in {folder}: point_cloud.ply (SuperSplat opens it, too), metrics.json, renders/")
     if parts := missing_parts(state.shared):
         print(
             f"point_cloud.ply does not hold {describe_parts(parts)}, which other programs therefore leave out;"

@@ -91,7 +91,7 @@ def _importance(drawn: Drawn) -> Picture:
     highest = float(weights.max(initial=0.0))
     shown = colorize(np.log1p(weights), 0.0, float(np.log1p(highest)), "inferno")
     return Picture(
-        shown, f"blend weight in this view of the dominant Gaussian: 0 to {highest:.3g} pixels (logarithmic)"
+        shown, f"blend weight in this view of the dominant Gaussian: 0 to {highest:,.0f} pixels (logarithmic)"
     )
 
 

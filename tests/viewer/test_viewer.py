@@ -168,9 +168,9 @@ def test_a_layer_that_the_renderer_lacks(trained):
 
 
 def test_tile_loads_by_hand():
-    """Three tiles of 2 x 2 pixels side by side, of which the last reaches beyond an image of 5 x 2."""
-    bins = TileBins(np.arange(5), np.array([0, 1, 1, 5]), np.arange(5), np.arange(6), TileGrid(5, 2, 2, 2))
-    np.testing.assert_array_equal(tile_loads(bins), [[1, 1, 0, 0, 4]] * 2)
+    """Two rows of three tiles of 2 x 2 pixels, of which the last reach beyond an image of 5 x 3."""
+    bins = TileBins(np.arange(8), np.array([0, 1, 1, 5, 7, 8, 8]), np.arange(8), np.arange(9), TileGrid(5, 3, 2, 2))
+    np.testing.assert_array_equal(tile_loads(bins), [[1, 1, 0, 0, 4]] * 2 + [[2, 2, 1, 1, 0]])
     assert find_bins((1, (np.zeros(3), bins))) is bins and find_bins((1, [bins])) is None
 
 
@@ -192,6 +192,7 @@ def test_a_film(trained, tmp_path):
     assert said == [(k, 5) for k in range(1, 6)]
     with Image.open(film.path) as image:
         assert (image.size, image.n_frames) == ((24, 16), 5)
+        assert np.ptp(np.asarray(image.convert("RGB")), axis=2).max() > 100, "depths have colours, alpha has none"
     with pytest.raises(InputError, match=r"\.gif or \.mp4"):
         write_travel(trained, keyframes, film._replace(path=tmp_path / "view.avi"), lambda *_: None)
     with pytest.raises(InputError, match="at least two"):
