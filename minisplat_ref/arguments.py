@@ -13,6 +13,7 @@ Commands = argparse._SubParsersAction
 
 BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
 CUDA = ("cuda", "cuda-atomic")  # need a GPU
+VIEWER_PORT = 8080
 SYNTHETIC_SCENES = (  # datasets.synthetic.SCENE_NAMES, which would load NumPy
     *("room", "plain-wall", "glossy", "outdoor"),
     *("staircase", "noisy-sphere", "facing-spheres", "box-city"),

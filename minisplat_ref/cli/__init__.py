@@ -44,12 +44,13 @@ from . import (
     synthetic,
     train,
     undistort,
+    view,
 )
 
 GROUPS = {
     "start here": (demo, photos),
     "preparing scenes": (sfm, undistort, downscale, synthetic),
-    "training and its results": (train, render, evaluate, simplify, mesh, convert, compare, info),
+    "training and its results": (train, view, render, evaluate, simplify, mesh, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
     "the program itself": (extensions, cache),
 }

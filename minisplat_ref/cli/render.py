@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from minisplat_ref.arguments import (
     Commands,
@@ -16,13 +16,11 @@ from minisplat_ref.arguments import (
     integer,
     positive,
 )
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
-    from minisplat_ref.runs.scoring import Trained
-    from minisplat_ref.types import Frame
+    from minisplat_ref.runs.source import Source
 
 DESCRIPTION = """\
 Render a run (its --out folder), or Gaussians that any program wrote: a PLY or a
@@ -104,13 +102,21 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.reports.images import depth_image, depth_range
     from minisplat_ref.runs.first_use import warn_if_not_kept
     from minisplat_ref.runs.notices import warn_of_model
+    from minisplat_ref.runs.source import open_source
     from minisplat_ref.types import view_from
 
-    source = _open(args)
+    source = open_source(
+        args.input,
+        args.extension,
+        args.environment,
+        background=args.background,
+        profile=args.profile,
+        backend=args.backend,
+    )
     warn_of_model(source.trained.model, args.input)
     warn_if_not_kept(source.trained.backend)
     views = _choose_views(args, source)
-    out: Path = args.out or source.default_out
+    out: Path = args.out or source.beside("views")
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
     memory.check_render_size(largest.width, largest.height, args.depth)
     if args.film is not None:
@@ -142,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _channels(args: argparse.Namespace, source: "_Source", wants: frozenset[str]) -> dict[str, slice]:
+def _channels(args: argparse.Namespace, source: "Source", wants: frozenset[str]) -> dict[str, slice]:
     """Return the channels that are drawn, by name.
 
     Raises
@@ -184,68 +190,9 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
     run_folder.write_json(out / LIST, {"pictures": list(names)})
 
 
-class _Source(NamedTuple):
-    """What to render, and from where unless the command line says otherwise."""
-
-    trained: "Trained"
-    """In its frame, like the cameras."""
-    cameras: "list[Viewpoint]"
-    default_out: Path
-    frame: "Frame"
-
-
-def _open(args: argparse.Namespace) -> _Source:
-    path: Path = args.input
-    if not path.exists():
-        raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
-    source = _open_run(path, args) if path.is_dir() else _open_file(path, args)
-    given = {name: getattr(args, name) for name in ("background", "profile", "backend")}
-    given = {name: value for name, value in given.items() if value is not None}
-    if args.environment is not None:
-        from minisplat_ref.mechanisms.gbuffer.lighting import relight
-
-        given["model"] = relight(source.trained.model, args.environment)
-    return source._replace(trained=source.trained._replace(**given))
-
-
-def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
-    from minisplat_ref.io import viewpoints
-    from minisplat_ref.runs import run_folder
-    from minisplat_ref.runs.scoring import load_trained
-    from minisplat_ref.runs.settings import load_frame
-
-    if args.extension is not None:
-        raise InputError(f"{folder} has its extension recorded: leave out --extension {args.extension}")
-    frame = load_frame(folder)
-    cameras = _place(viewpoints.read(folder / run_folder.CAMERAS), frame)
-    return _Source(load_trained(folder), cameras, folder / "views", frame)
-
-
-def _open_file(path: Path, args: argparse.Namespace) -> _Source:
-    import numpy as np
-
-    from minisplat_ref.io.frames import frame_of_means
-    from minisplat_ref.runs.model_file import read_model
-    from minisplat_ref.runs.scoring import Trained
-    from minisplat_ref.runs.settings import place_model
-    from minisplat_ref.types import Model
-
-    read = read_model(path, args.extension)
-    frame = frame_of_means(read.population.means)
-    model = place_model(Model(read.population), read.owner, frame)
-    trained = Trained(model, read.owner.representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
-    return _Source(trained, [], path.with_name(f"{path.stem}-views"), frame)
-
-
-def _place(views: "list[Viewpoint]", frame: "Frame") -> "list[Viewpoint]":
-    """Return viewpoints of the files in the frame of the model."""
-    from minisplat_ref.io.frames import place_camera
-
-    return [view._replace(camera=place_camera(view.camera, frame)) for view in views]
-
-
-def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]":
+def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint]":
     from minisplat_ref.io import orbits, viewpoints
+    from minisplat_ref.runs.source import place_viewpoints
 
     which: str = args.cameras or ("test" if source.cameras else "orbit")
     if which == "orbit":
@@ -255,7 +202,7 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
         means = source.trained.model.gaussians.means
         return orbits.orbit(means, followed, args.frames, width, height, args.arc)
     if which not in RUN_CAMERAS:
-        return _place(viewpoints.read(Path(which)), source.frame)
+        return place_viewpoints(viewpoints.read(Path(which)), source.frame)
     if not source.cameras:
         raise InputError(f"--cameras {which} needs a run folder: give --cameras orbit or a JSON file with {args.input}")
     views = [view for view in source.cameras if which in ("all", view.split)]

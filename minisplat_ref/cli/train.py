@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.arguments import (
+    VIEWER_PORT,
     Commands,
     HelpFormatter,
     add_renderer_arguments,
@@ -21,6 +22,7 @@ from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
     from minisplat_ref.lpips import Network
+    from minisplat_ref.runs.run import Watch
     from minisplat_ref.runs.settings import Settings
     from minisplat_ref.runs.simplification import Target
     from minisplat_ref.training.schedule import Recipe
@@ -87,7 +89,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--scene", dest="moved", metavar="PATH", help="with --resume: where its photographs are now")
     parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
 
-    parser.add_argument("--preview", action="store_true", help="keep DIR/preview.png up to date while training")
+    parser.add_argument("--preview", action="store_true", help="keep DIR/preview.png up to date; --view: in a browser")
+    parser.add_argument("--view", nargs="?", type=integer(0), const=VIEWER_PORT, metavar="PORT", help=argparse.SUPPRESS)
 
     data = parser.add_argument_group("photographs")
     data.add_argument("--downscale", type=integer(1), metavar="D", help="make them D times smaller (default 1)")
@@ -166,6 +169,10 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.training.interruption import terminated_like_interrupted
 
     given = vars(args)
+    if "view" in given:
+        from minisplat_ref.viewer.browser import open_server
+
+        given["server"] = open_server(given["view"], "training")
     with terminated_like_interrupted():
         return _resume(args.resume, given) if "resume" in given else _start(given)
 
@@ -382,7 +389,7 @@ def _train(
     if room:
         print(room)
     check_every = given.get("check_every", Guard().every)
-    outcome = run_training(folder, scene, settings, recipe, state, network, check_every, given.get("preview", False))
+    outcome = run_training(folder, scene, settings, recipe, state, network, check_every, _watches(given))
     if outcome.evaluation is None or not outcome.is_complete:
         if state.is_whole:
             measured = "" if outcome.evaluation else " but not measured"
@@ -394,7 +401,7 @@ def _train(
     print(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
-    print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    print(f"results in {folder}: point_cloud.ply (SuperSplat opens it, too), metrics.json, renders/")
     if parts := missing_parts(state.shared):
         print(
             f"point_cloud.ply does not hold {describe_parts(parts)}, which other programs therefore leave out;"
@@ -402,6 +409,20 @@ def _train(
         )
     print(f"open {(folder / run_folder.REPORT).resolve()}")
     return _simplify(folder, settings)
+
+
+def _watches(given: dict[str, Any]) -> "list[Watch]":
+    """Return what shows the training while it runs, as the command line asks for it."""
+    from minisplat_ref.runs.preview import make_preview
+
+    watches: list[Watch] = [make_preview] if given.get("preview", False) else []
+    if "server" in given:
+        from minisplat_ref.viewer.browser import address
+        from minisplat_ref.viewer.live import make_live_view
+
+        print(f"open {address(given['server'])} in a browser to watch")
+        watches.append(make_live_view(given["server"]))
+    return watches
 
 
 def _simplify(folder: Path, settings: "Settings") -> int:

@@ -108,7 +108,7 @@ def _path_of_cameras(cameras: Sequence[Camera], width: int) -> _Path:
     centres = np.array([camera.center for camera in cameras])  # [V, 3]
     forwards = rotations[:, 2]  # [V, 3]
     target = nearest_to_axes(centres, forwards)
-    up = _up(rotations)
+    up = common_up(rotations)
     heights = (centres - target) @ up  # [V]
     radial = centres - target - heights[:, None] * up  # [V, 3]
     radii = np.linalg.norm(radial, axis=1)  # [V]
@@ -138,7 +138,7 @@ def nearest_to_axes(centres: Floats, forwards: Floats) -> Floats:
     return target + max(spread - float((target - middle) @ ahead), 0.0) * ahead
 
 
-def _up(rotations: Floats) -> Floats:
+def common_up(rotations: Floats) -> Floats:
     """Return the direction [3] at a right angle to the horizontal edges of all images."""
     rights, mean_up = rotations[:, 0], -rotations[:, 1].mean(axis=0)  # [V, 3], [3]
     # The mean itself leans towards an arc of cameras that look down; it decides where all edges are parallel.

@@ -10,7 +10,7 @@ import contextlib
 import math
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,6 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.runs import checkpoints, curve, events, fingerprint, run_folder
-from minisplat_ref.runs.preview import make_preview
 from minisplat_ref.runs.progress import Clock, Progress
 from minisplat_ref.runs.scoring import measure, score, to_metrics
 from minisplat_ref.runs.settings import Settings, save_model, to_config
@@ -33,6 +32,9 @@ from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Scene
+
+Watch = Callable[[Path, Scene, Settings, Progress], Callable[[StepReport], None]]
+"""Makes a callback of the training loop that shows a person how a run in a folder is doing; it pauses the progress."""
 
 RECENT = 100  # iterations by which the time of the next ones is foreseen
 
@@ -56,7 +58,7 @@ def run_training(
     state: TrainState,
     network: Network | None = None,
     check_every: int = Guard().every,
-    shows_preview: bool = False,
+    watches: Sequence[Watch] = (),
 ) -> Outcome:
     """Train, save and measure.
 
@@ -76,8 +78,8 @@ def run_training(
         Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after.
     check_every : int
         Iterations after which parameters and gradients are looked at for numbers that are not finite.
-    shows_preview : bool
-        Keep an image of the training up to date: :mod:`.preview`.
+    watches : sequence of callable
+        What shows the training to a person while it runs, such as :func:`.preview.make_preview`.
 
     Returns
     -------
@@ -94,7 +96,7 @@ def run_training(
         if state.step == 0:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
-        clock = _train(folder, scene, settings, recipe, state, surface, check_every, shows_preview)
+        clock = _train(folder, scene, settings, recipe, state, surface, check_every, watches)
         is_saved = _save(folder, settings, recipe, state)
         evaluation = _measure(folder, scene, settings, state, clock, surface, network) if is_saved else None
         return Outcome(evaluation, clock.seconds, state.step >= last_step(state, recipe, settings.iterations))
@@ -127,7 +129,7 @@ def _train(
     state: TrainState,
     surface: Surface | None,
     check_every: int,
-    shows_preview: bool,
+    watches: Sequence[Watch],
 ) -> Clock:
     """Train to the end or to Ctrl-C; return how long it took."""
     total = settings.iterations if recipe.cooling is None else state.pace.last_step
@@ -139,8 +141,7 @@ def _train(
     if settings.eval_every:
         curve.keep_until(folder / run_folder.CURVE, state.step)
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
-    if shows_preview:
-        callbacks.append(make_preview(folder, scene, settings, progress))
+    callbacks.extend(watch(folder, scene, settings, progress) for watch in watches)
     if settings.minutes is not None:
         callbacks.append(_in_time(settings, recipe, progress, len(scene.train_views)))
     callbacks.append(checkpoints.save_regularly(folder, recipe))  # after the records: what it continues from is in them

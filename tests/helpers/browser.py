@@ -9,12 +9,14 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "chrome-headless-shell")
 OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run")
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # without a graphics card
 SECONDS = 60  # for the browser to answer; it takes a fraction of one on an idle machine
 
 
@@ -26,7 +28,7 @@ def find_browser() -> str | None:
 class Browser:
     """One headless browser with one tab; a context manager."""
 
-    def __init__(self, program: str, profile: Path) -> None:
+    def __init__(self, program: str, profile: Path, options: Sequence[str] = ()) -> None:
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
 
@@ -34,9 +36,15 @@ class Browser:
             os.dup2(to_browser, 63), os.dup2(from_browser, 64)
             os.dup2(63, 3), os.dup2(64, 4)
 
-        command = [program, *OPTIONS, f"--user-data-dir={profile}", "--remote-debugging-pipe", "about:blank"]
+        command = [program, *OPTIONS, *options, f"--user-data-dir={profile}", "--remote-debugging-pipe", "about:blank"]
+        environment = {**os.environ, "LC_ALL": "en_US.UTF-8"}  # scripts refuse the language of LC_ALL=C, en-US@posix
         self._process = subprocess.Popen(
-            command, preexec_fn=wire, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            preexec_fn=wire,
+            close_fds=False,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         os.close(to_browser), os.close(from_browser)
         self._buffer, self._n, self._session = b"", 0, None
@@ -82,8 +90,8 @@ class Browser:
         text, self._buffer = self._buffer.split(b"\0", 1)
         return json.loads(text)
 
-    def open(self, path: Path, *, width: int, is_dark: bool = False, has_script: bool = True) -> None:
-        """Load a page in a window ``width`` pixels wide."""
+    def open(self, page: Path | str, *, width: int, is_dark: bool = False, has_script: bool = True) -> None:
+        """Load a file, or what an address gives, in a window ``width`` pixels wide."""
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 700
         )
@@ -91,7 +99,7 @@ class Browser:
         self.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         self.send("Emulation.setScriptExecutionDisabled", value=not has_script)
         self.events.clear()
-        self.send("Page.navigate", url=path.resolve().as_uri())
+        self.send("Page.navigate", url=page.resolve().as_uri() if isinstance(page, Path) else page)
         while not any(event.get("method") == "Page.loadEventFired" for event in self.events):
             self.events.append(self._receive())
 
