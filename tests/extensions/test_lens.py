@@ -11,6 +11,7 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.lens.fisheye import rays_of, take_photographs
 from minisplat_ref.extensions.lens.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
 from minisplat_ref.extensions.lens.reference import RESPONSE, hit, project
@@ -158,6 +159,52 @@ def test_the_study_of_footprints(tmp_path):
     for errors in json.loads((tmp_path / "result.json").read_text())["errors"].values():
         assert errors["EWA"][-1] > errors["EWA"][0] > errors["UT"][0] > 0.02
         assert max(errors["exact"]) < 0.05  # what the bounds leave out
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    return take_photographs(32, 0)
+
+
+def test_fisheye_photographs_show_the_points_where_the_camera_says(photographs):
+    """A point drawn on a photograph has its colour where the fisheye projects it; 150 degrees span the image."""
+    camera = photographs.fisheye.train_views[0].camera
+    edges = rays_of(camera, 0.0)[camera.width * (camera.height // 2)]
+    assert np.degrees(np.arccos(edges[2])) == pytest.approx(75, abs=0.2)  # half a line above the axis
+    scene, errors = photographs.fisheye, []
+    for view in scene.train_views[:4]:
+        x = scene.points @ view.camera.cam_from_world_R.T + view.camera.cam_from_world_t
+        pixels = model_of(view.camera).project(x, view.camera)
+        is_inside = ((pixels > 0) & (pixels < (32, 24))).all(axis=1)
+        column, line = pixels[is_inside].astype(int).T
+        shown = view.image[line, column].astype(float)
+        errors.append(np.median(np.abs(shown - scene.point_colors[is_inside])))
+    assert is_inside.sum() > 1000 and np.mean(errors) < 25  # half of them are hidden or at edges
+
+
+def test_what_undistortion_keeps(photographs):
+    """The kept pixels are around the axis, and the undistorted photograph shows what the fisheye shows there."""
+    kept, angles = photographs.is_kept, photographs.angles
+    assert kept[12, 16] and not kept[12, 0] and not kept[0, 0] and 0.3 < kept.mean() < 0.8
+    assert angles[kept].max() < angles.max() - 20
+    bent, straight = photographs.fisheye.train_views[0], photographs.pinhole.train_views[0]
+    lines, columns = np.nonzero(kept & (angles < 30))
+    directions = rays_of(bent.camera).reshape(24, 32, 3)[lines, columns]
+    pixels = model_of(straight.camera).project(directions, straight.camera).astype(int)
+    difference = straight.image[pixels[:, 1], pixels[:, 0]].astype(float) - bent.image[lines, columns]
+    assert np.median(np.abs(difference)) < 12
+
+
+def test_the_study_of_the_fisheye(tmp_path, capsys):
+    """At a tiny size; the arms have equal numbers of Gaussians, and the folder resumes without another training."""
+    out = ["study", "lens/fisheye", "--width", "24", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert main(out) == 0
+    result = json.loads((tmp_path / "s" / "result.json").read_text())
+    assert len(result["records"]) == 3 and len({record["gaussians"] for record in result["records"]}) == 1
+    assert len({record["border"] for record in result["records"]}) == 3
+    capsys.readouterr()
+    assert main(out) == 0 and "undistortion keeps" in capsys.readouterr().out
+    assert json.loads((tmp_path / "s" / "result.json").read_text()) == result
 
 
 # --- from photographs to a rendering ---
