@@ -12,12 +12,12 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.lens.fisheye import rays_of, take_photographs
-from minisplat_ref.extensions.lens.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
-from minisplat_ref.extensions.lens.reference import RESPONSE, hit, project
 from minisplat_ref.extensions.lens.stages import OPTICS, stages
 from minisplat_ref.io import load_scene, viewpoints
+from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.models import model_of
+from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE, hit, project
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.reference.covariance import covariances
@@ -272,6 +272,9 @@ def test_the_response_lists_what_it_differentiates():
 # --- gsplat's call ---
 
 
+ALONG_RAYS = {"with_ut": True, "with_eval3d": True}
+
+
 def call_of(rng, camera):
     means, quats, scales, opacities = activate(make_gaussians(rng, 8, sh_degree=0))
     M = np.eye(4)
@@ -289,21 +292,24 @@ def call_of(rng, camera):
         {
             "radial_coeffs": np.array([[-0.2, 0.05, 0.01, 0.0, 0.01, 0.0]]),
             "tangential_coeffs": np.array([[0.01, -0.02]]),
+            **ALONG_RAYS,
         },
-        {"camera_model": "fisheye", "radial_coeffs": np.array([[0.05, -0.02, 0.01, 0.0]])},
+        {"camera_model": "fisheye", "radial_coeffs": np.array([[0.05, -0.02, 0.01, 0.0]]), **ALONG_RAYS},
+        {"camera_model": "ortho"},
     ],
-    ids=["brown", "fisheye"],
+    ids=["brown", "fisheye", "ortho"],
 )
 def test_gsplats_call_has_the_gradient_of_its_images(lens, backend):
     rng = np.random.default_rng(8)
     call = {**call_of(rng, make_camera(rng=rng)), **lens, "backend": backend}
-    image, alpha = rasterization(**call)
+    image, alpha, meta = rasterization(**call)
+    assert (meta["radii"] > 0).any() and meta["means2d"].shape == (1, 8, 2) and meta["depths"].shape == (1, 8)
     v_image, v_alpha = rng.normal(size=image.shape), rng.normal(size=alpha.shape)
     v = rasterization_vjp(**call, v_render_colors=v_image, v_render_alphas=v_alpha)
     names = ["means", "quats", "scales", "opacities", "colors", "backgrounds", "viewmats"]
 
     def function(*arrays):
-        return rasterization(**{**call, **dict(zip(names, arrays, strict=True))})
+        return rasterization(**{**call, **dict(zip(names, arrays, strict=True))})[:2]
 
     inputs, gradient = [call[name] for name in names], [v[f"v_{name}"] for name in names]
     keep = names.index("viewmats")  # its last row is no variable; a rotation must stay one to the checks
@@ -343,13 +349,15 @@ def test_other_cameras_project_as_gsplats_own_statement(model):
 
 def test_gsplats_call_refuses_what_it_cannot_draw():
     call = call_of(np.random.default_rng(0), make_camera())
-    image, _ = rasterization(**call, camera_model="ortho")
+    image, _, _ = rasterization(**call, camera_model="ortho")
     assert image.shape == (1, 18, 24, 3)
     for wrong, message in (
-        ({"camera_model": "lidar"}, "has no exact rays here"),
-        ({"radial_coeffs": np.zeros((1, 4))}, "radial_coeffs must be 1 x 6 finite numbers"),
+        ({"camera_model": "lidar"}, "is not computed: choose from"),
+        ({"camera_model": "fisheye"}, "give with_ut=True and with_eval3d=True"),
+        ({"camera_model": "ortho", **ALONG_RAYS}, "leave out with_ut"),
+        ({**ALONG_RAYS, "radial_coeffs": np.zeros((1, 4))}, "radial_coeffs must be 1 x 6 finite numbers"),
         ({"camera_model": "ortho", "radial_coeffs": np.zeros((1, 6))}, "has no distortion"),
-        ({"camera_model": "fisheye", "tangential_coeffs": np.zeros((1, 2))}, "has no tangential_coeffs"),
+        ({**ALONG_RAYS, "camera_model": "fisheye", "tangential_coeffs": np.zeros((1, 2))}, "has no tangential_coeffs"),
         ({"sh_degree": 3}, "sh_degree is not computed"),
     ):
         with pytest.raises(InputError, match=message):

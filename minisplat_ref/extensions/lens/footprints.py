@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.lens.reference import hit, project
 from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
+from minisplat_ref.mechanisms.cameras.ray_footprints import hit, project
 from minisplat_ref.mechanisms.cameras.unscented import unscented
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reports.palette import BLUE, GREY, RED
