@@ -96,18 +96,19 @@ def _is_other(*defaults: Any) -> Callable[[Any], bool]:
 
 _UNDISTORTED = "undistort the photographs, as minisplat-ref undistort does"
 _IMAGE_PLANE = "Gaussians are projected by the Jacobian, and blended in the image: leave it out"
+_CAMERAS = "call minisplat_ref.mechanisms.cameras.gsplat_call.rasterization, which computes it"
 REFUSED: Mapping[str, Refused] = {
-    "camera_model": Refused(_is_other("pinhole"), "only pinhole cameras are computed: give 'pinhole'"),
+    "camera_model": Refused(_is_other("pinhole"), f"give 'pinhole', or {_CAMERAS}"),
     "sparse_grad": Refused(_is_true, "gradients are dense arrays, of the same values: leave it out"),
     "absgrad": Refused(_is_true, "sums of absolute gradients are not kept: leave it out"),
     "distributed": Refused(_is_true, "there is one process: leave it out, and give all Gaussians"),
-    "with_ut": Refused(_is_true, _IMAGE_PLANE),
-    "with_eval3d": Refused(_is_true, _IMAGE_PLANE),
+    "with_ut": Refused(_is_true, _CAMERAS),
+    "with_eval3d": Refused(_is_true, _CAMERAS),
     "return_normals": Refused(_is_true, "it needs with_eval3d, which is not computed: leave it out"),
     "global_z_order": Refused(lambda value: not value, "Gaussians are sorted by their depth z: give True"),
     "rays": Refused(_is_given, "rays are those of the cameras: give viewmats and Ks"),
-    "radial_coeffs": Refused(_is_given, _UNDISTORTED),
-    "tangential_coeffs": Refused(_is_given, _UNDISTORTED),
+    "radial_coeffs": Refused(_is_given, f"{_UNDISTORTED}, or {_CAMERAS}"),
+    "tangential_coeffs": Refused(_is_given, f"{_UNDISTORTED}, or {_CAMERAS}"),
     "thin_prism_coeffs": Refused(_is_given, _UNDISTORTED),
     "ftheta_coeffs": Refused(_is_given, "only pinhole cameras are computed: leave it out"),
     "lidar_coeffs": Refused(_is_given, "only pinhole cameras are computed: leave it out"),

@@ -129,7 +129,11 @@ def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.rand
 
 
 def are_seen(points: Floats, cameras: Sequence[Camera]) -> Bools:
-    """Return for each point [P, 3] whether it is inside the image of any camera, [P]."""
+    """Return for each point [P, 3] whether it is inside the image of any camera, [P].
+
+    What a lens does is not known here (:mod:`minisplat_ref.mechanisms.cameras` stands above), so a camera with optics
+    counts as seeing all that its kind may: a fisheye and parallel rays every point, others what is in front of them.
+    """
     is_seen = np.zeros(len(points), bool)
     for camera in cameras:
         is_seen |= _is_inside_image(points, camera)
@@ -139,6 +143,8 @@ def are_seen(points: Floats, cameras: Sequence[Camera]) -> Bools:
 def _is_inside_image(points: Floats, camera: Camera) -> Bools:
     x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
     is_in_front = z > 0
+    if camera.optics is not None:
+        return is_in_front if camera.optics.model == "brown" else np.ones(len(points), bool)
     z = np.where(is_in_front, z, 1.0)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     return is_in_front & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)

@@ -11,12 +11,13 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.lens.gsplat_call import rasterization, rasterization_vjp
+from minisplat_ref.extensions.lens.fisheye import rays_of, take_photographs
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
-from minisplat_ref.extensions.lens.reference import RESPONSE, hit, project
 from minisplat_ref.extensions.lens.stages import OPTICS, stages
 from minisplat_ref.io import load_scene, viewpoints
+from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.models import model_of
+from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE, hit, project
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.reference.covariance import covariances
@@ -158,6 +159,53 @@ def test_the_study_of_footprints(tmp_path):
     for errors in json.loads((tmp_path / "result.json").read_text())["errors"].values():
         assert errors["EWA"][-1] > errors["EWA"][0] > errors["UT"][0] > 0.02
         assert max(errors["exact"]) < 0.05  # what the bounds leave out
+        assert max(errors["bounds"]) < max(errors["exact"])  # the rest is below alpha_min
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    return take_photographs(32, 0)
+
+
+def test_fisheye_photographs_show_the_points_where_the_camera_says(photographs):
+    """A point drawn on a photograph has its colour where the fisheye projects it; 150 degrees span the image."""
+    camera = photographs.fisheye.train_views[0].camera
+    edges = rays_of(camera, 0.0)[camera.width * (camera.height // 2)]
+    assert np.degrees(np.arccos(edges[2])) == pytest.approx(75, abs=0.2)  # half a line above the axis
+    scene, errors = photographs.fisheye, []
+    for view in scene.train_views[:4]:
+        x = scene.points @ view.camera.cam_from_world_R.T + view.camera.cam_from_world_t
+        pixels = model_of(view.camera).project(x, view.camera)
+        is_inside = ((pixels > 0) & (pixels < (32, 24))).all(axis=1)
+        column, line = pixels[is_inside].astype(int).T
+        shown = view.image[line, column].astype(float)
+        errors.append(np.median(np.abs(shown - scene.point_colors[is_inside])))
+    assert is_inside.sum() > 1000 and np.mean(errors) < 25  # half of them are hidden or at edges
+
+
+def test_what_undistortion_keeps(photographs):
+    """The kept pixels are around the axis, and the undistorted photograph shows what the fisheye shows there."""
+    kept, angles = photographs.is_kept, photographs.angles
+    assert kept[12, 16] and not kept[12, 0] and not kept[0, 0] and 0.3 < kept.mean() < 0.8
+    assert angles[kept].max() < angles.max() - 20
+    bent, straight = photographs.fisheye.train_views[0], photographs.pinhole.train_views[0]
+    lines, columns = np.nonzero(kept & (angles < 30))
+    directions = rays_of(bent.camera).reshape(24, 32, 3)[lines, columns]
+    pixels = model_of(straight.camera).project(directions, straight.camera).astype(int)
+    difference = straight.image[pixels[:, 1], pixels[:, 0]].astype(float) - bent.image[lines, columns]
+    assert np.median(np.abs(difference)) < 12
+
+
+def test_the_study_of_the_fisheye(tmp_path, capsys):
+    """At a tiny size; the arms have equal numbers of Gaussians, and the folder resumes without another training."""
+    out = ["study", "lens/fisheye", "--width", "24", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert main(out) == 0
+    result = json.loads((tmp_path / "s" / "result.json").read_text())
+    assert len(result["records"]) == 3 and len({record["gaussians"] for record in result["records"]}) == 1
+    assert len({record["border"] for record in result["records"]}) == 3
+    capsys.readouterr()
+    assert main(out) == 0 and "undistortion keeps" in capsys.readouterr().out
+    assert json.loads((tmp_path / "s" / "result.json").read_text()) == result
 
 
 # --- from photographs to a rendering ---
@@ -225,6 +273,9 @@ def test_the_response_lists_what_it_differentiates():
 # --- gsplat's call ---
 
 
+ALONG_RAYS = {"with_ut": True, "with_eval3d": True}
+
+
 def call_of(rng, camera):
     means, quats, scales, opacities = activate(make_gaussians(rng, 8, sh_degree=0))
     M = np.eye(4)
@@ -242,21 +293,24 @@ def call_of(rng, camera):
         {
             "radial_coeffs": np.array([[-0.2, 0.05, 0.01, 0.0, 0.01, 0.0]]),
             "tangential_coeffs": np.array([[0.01, -0.02]]),
+            **ALONG_RAYS,
         },
-        {"camera_model": "fisheye", "radial_coeffs": np.array([[0.05, -0.02, 0.01, 0.0]])},
+        {"camera_model": "fisheye", "radial_coeffs": np.array([[0.05, -0.02, 0.01, 0.0]]), **ALONG_RAYS},
+        {"camera_model": "ortho"},
     ],
-    ids=["brown", "fisheye"],
+    ids=["brown", "fisheye", "ortho"],
 )
 def test_gsplats_call_has_the_gradient_of_its_images(lens, backend):
     rng = np.random.default_rng(8)
     call = {**call_of(rng, make_camera(rng=rng)), **lens, "backend": backend}
-    image, alpha = rasterization(**call)
+    image, alpha, meta = rasterization(**call)
+    assert (meta["radii"] > 0).any() and meta["means2d"].shape == (1, 8, 2) and meta["depths"].shape == (1, 8)
     v_image, v_alpha = rng.normal(size=image.shape), rng.normal(size=alpha.shape)
     v = rasterization_vjp(**call, v_render_colors=v_image, v_render_alphas=v_alpha)
     names = ["means", "quats", "scales", "opacities", "colors", "backgrounds", "viewmats"]
 
     def function(*arrays):
-        return rasterization(**{**call, **dict(zip(names, arrays, strict=True))})
+        return rasterization(**{**call, **dict(zip(names, arrays, strict=True))})[:2]
 
     inputs, gradient = [call[name] for name in names], [v[f"v_{name}"] for name in names]
     keep = names.index("viewmats")  # its last row is no variable; a rotation must stay one to the checks
@@ -296,13 +350,15 @@ def test_other_cameras_project_as_gsplats_own_statement(model):
 
 def test_gsplats_call_refuses_what_it_cannot_draw():
     call = call_of(np.random.default_rng(0), make_camera())
-    image, _ = rasterization(**call, camera_model="ortho")
+    image, _, _ = rasterization(**call, camera_model="ortho")
     assert image.shape == (1, 18, 24, 3)
     for wrong, message in (
-        ({"camera_model": "lidar"}, "has no exact rays here"),
-        ({"radial_coeffs": np.zeros((1, 4))}, "radial_coeffs must be 1 x 6 finite numbers"),
+        ({"camera_model": "lidar"}, "is not computed: choose from"),
+        ({"camera_model": "fisheye"}, "give with_ut=True and with_eval3d=True"),
+        ({"camera_model": "ortho", **ALONG_RAYS}, "leave out with_ut"),
+        ({**ALONG_RAYS, "radial_coeffs": np.zeros((1, 4))}, "radial_coeffs must be 1 x 6 finite numbers"),
         ({"camera_model": "ortho", "radial_coeffs": np.zeros((1, 6))}, "has no distortion"),
-        ({"camera_model": "fisheye", "tangential_coeffs": np.zeros((1, 2))}, "has no tangential_coeffs"),
+        ({**ALONG_RAYS, "camera_model": "fisheye", "tangential_coeffs": np.zeros((1, 2))}, "has no tangential_coeffs"),
         ({"sh_degree": 3}, "sh_degree is not computed"),
     ):
         with pytest.raises(InputError, match=message):

@@ -11,10 +11,11 @@ import pytest
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.surfels.gsplat_call import NAMES, rasterization_2dgs, rasterization_2dgs_vjp
-from minisplat_ref.mechanisms.surfels.oracle.comparison import STAGES, choose_renderer, compare, truth
-from minisplat_ref.mechanisms.surfels.oracle.hard_cases import CASES, run_surfel_cases, select
+from minisplat_ref.mechanisms.surfels.oracle.call import CALL, STAGES
+from minisplat_ref.mechanisms.surfels.oracle.hard_cases import CASES, run_cases, select
 from minisplat_ref.mechanisms.surfels.oracle.planted import PLANTED
 from minisplat_ref.mechanisms.surfels.oracle.scenes import scenes
+from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
 from tolerances import GRADIENT_STEP_IMAGE
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("torch", "gsplat"))
@@ -22,37 +23,37 @@ HAS_PEERS = all(importlib.util.find_spec(name) for name in ("torch", "gsplat"))
 
 @pytest.fixture(scope="module")
 def known():
-    return {scene.name: (scene, truth(scene)) for scene in scenes()}
+    return {scene.name: (scene, truth(CALL, scene)) for scene in scenes()}
 
 
 @pytest.mark.parametrize("error", PLANTED)
 def test_a_planted_error_is_named_at_its_stage(error, known):
-    report = compare(choose_renderer(f"planted:{error}"), known)
+    report = compare(CALL, choose_renderer(CALL, f"planted:{error}"), known)
     assert report.settings["first_difference"].partition(":")[0] == PLANTED[error].stage
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_kernels_agree_at_every_stage(dtype, known):
-    report = compare(choose_renderer("cpu", dtype), known)
+    report = compare(CALL, choose_renderer(CALL, "cpu", dtype), known)
     assert len(report.cases) == len(STAGES) and report.n_failed == 0, report.cases
     assert report.settings == {"first_difference": None, "not_given": []}
 
 
 @pytest.mark.skipif(not HAS_PEERS, reason="needs torch and gsplat: pip install 'minisplat_ref[peers]'")
 def test_gsplats_own_torch_functions_agree_in_every_result_and_gradient(known):
-    report = compare(choose_renderer("gsplat-torch"), known)
+    report = compare(CALL, choose_renderer(CALL, "gsplat-torch"), known)
     assert len(report.cases) == len(STAGES) and report.n_failed == 0, report.cases
 
 
 def test_hard_cases_have_the_answers_that_were_worked_out():
-    report = run_surfel_cases()
+    report = run_cases()
     assert len(report.cases) == 3 * len(CASES) and report.n_failed == 0, report.cases
 
 
 def test_a_wrong_answer_is_found():
     (case,) = select("faces the camera")
     wrong = case._replace(alphas={pixel: value + 1e-3 for pixel, value in case.alphas.items()})
-    assert run_surfel_cases((wrong,)).n_failed == 3
+    assert run_cases((wrong,)).n_failed == 3
 
 
 def test_every_cotangent_counts(known):
@@ -178,5 +179,5 @@ def test_bad_input_is_one_line(arguments, message, capsys):
 
 
 def test_importing_the_oracle_of_surfels_imports_no_torch():
-    code = "import sys, minisplat_ref.mechanisms.surfels.oracle.comparison; sys.exit('torch' in sys.modules)"
+    code = "import sys, minisplat_ref.mechanisms.surfels.oracle.call; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

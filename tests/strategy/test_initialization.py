@@ -8,7 +8,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.strategy import initialization
 from minisplat_ref.strategy.initialization import are_seen, from_points, initial_gaussians, random_points
-from minisplat_ref.types import Scene, View
+from minisplat_ref.types import Optics, Scene, View
 from scenes import make_camera
 from tolerances import ROUNDED_TO_FLOAT32
 
@@ -81,6 +81,17 @@ def test_a_camera_sees_up_to_the_edges_of_its_image():
     points = 2.0 * np.column_stack([(pixels - [12, 9]) / [30, 28], np.ones(9)])
     points[8] *= -1
     assert_array_equal(are_seen(points, [make_camera()]), [True] * 4 + [False] * 5)
+
+
+def test_a_lens_counts_as_seeing_what_its_kind_may():
+    """Beside a pinhole's image, and behind the camera: a distorting lens may see the first, a fisheye both."""
+    points = np.array([[0.0, 0.0, 2.0], [9.0, 0.0, 2.0], [0.0, 0.0, -2.0]])
+    for optics, expected in (
+        (None, [True, False, False]),
+        (Optics("brown", (0.1,) + 7 * (0.0,)), [True, True, False]),
+        (Optics("fisheye", (0.0,) * 4), [True, True, True]),
+    ):
+        assert are_seen(points, [make_camera()._replace(optics=optics)]).tolist() == expected
 
 
 def test_scene_decides_where_points_come_from(rng, monkeypatch):

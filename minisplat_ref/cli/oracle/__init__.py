@@ -1,8 +1,9 @@
 """``oracle``: checks gradients, hard cases and other backends against the reference; one module per check."""
 
 import argparse
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.arguments import Commands, HelpFormatter
 
@@ -35,17 +36,27 @@ def add_parser(commands: Commands) -> None:
         check.add_parser(checks)
 
 
-SURFELS_CALL = "rasterization_2dgs"
+CALLS = {
+    "rasterization_2dgs": "minisplat_ref.mechanisms.surfels.oracle",
+    "rasterization_cameras": "minisplat_ref.mechanisms.cameras.oracle",
+}
+"""Calls besides ``rasterization``, and the packages of their oracles."""
+
+
+def module_of(call: str, name: str) -> Any:
+    """Return a module of a call's oracle: ``call``, ``hard_cases``."""
+    return import_module(f"{CALLS[call]}.{name}")
 
 
 def add_call_argument(parser: argparse.ArgumentParser) -> None:
     """Add ``--call NAME``."""
     parser.add_argument(
         "--call",
-        choices=("rasterization", SURFELS_CALL),
+        choices=("rasterization", *CALLS),
         default="rasterization",
         metavar="NAME",
-        help="the call of gsplat's: rasterization (default), or rasterization_2dgs for 2D Gaussian Splatting",
+        help="rasterization (default), rasterization_2dgs for 2D Gaussian Splatting, or rasterization_cameras for"
+        " rasterization with camera_model, with_ut and with_eval3d",
     )
 
 

@@ -3,7 +3,7 @@
 import argparse
 
 from minisplat_ref.arguments import Commands, HelpFormatter
-from minisplat_ref.cli.oracle import SURFELS_CALL, add_call_argument, add_output_arguments, publish
+from minisplat_ref.cli.oracle import CALLS, add_call_argument, add_output_arguments, module_of, publish
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 
@@ -59,8 +59,9 @@ examples:
   minisplat-ref oracle compare planted:half-off-diagonal --scene ordinary
   minisplat-ref oracle compare profile:INRIA --scene sh3 --json differences.json
 
-of 2D Gaussian Splatting, on its own scenes (ordinary, median, hard):
+of surfels, and of lenses, fisheyes and parallel rays, on scenes of their own:
   minisplat-ref oracle compare my_module:my_function --call rasterization_2dgs
+  minisplat-ref oracle compare gsplat:rasterization --call rasterization_cameras
 
 your own renderer, in three lines:
   minisplat-ref oracle export golden
@@ -118,8 +119,8 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare every scene, print the table of stages."""
-    if args.call == SURFELS_CALL:
-        return _compare_surfels(args)
+    if args.call in CALLS:
+        return _compare_call(args)
     from minisplat_ref.oracle.comparison.renderers import choose_function, choose_renderer, choose_scenes, is_function
     from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 
@@ -148,19 +149,19 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _compare_surfels(args: argparse.Namespace) -> int:
-    """Do the same for ``rasterization_2dgs``, and name the first stage that differs."""
-    from minisplat_ref.mechanisms.surfels.oracle.comparison import choose_renderer, compare, truth
-    from minisplat_ref.mechanisms.surfels.oracle.scenes import scenes
+def _compare_call(args: argparse.Namespace) -> int:
+    """Do the same for another call of gsplat's, and name the first stage that differs."""
+    from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
 
     if args.against != "reference" or args.profile is not None:
-        raise InputError(f"{SURFELS_CALL} has one profile and is compared with the reference: leave the option out")
-    known = {scene.name: scene for scene in scenes()}
+        raise InputError(f"{args.call} has one profile and is compared with the reference: leave the option out")
+    call = module_of(args.call, "call").CALL
+    known = {scene.name: scene for scene in call.scenes()}
     if args.scene not in ("all", *known):
         raise InputError(f"scene {args.scene!r} is unknown; choose all or one of {', '.join(known)}")
-    renderer = choose_renderer(args.backend, args.dtype, args.arrays)
+    renderer = choose_renderer(call, args.backend, args.dtype, args.arrays)
     chosen = known if args.scene == "all" else {args.scene: known[args.scene]}
-    report = compare(renderer, {name: (scene, truth(scene)) for name, scene in chosen.items()})
+    report = compare(call, renderer, {name: (scene, truth(call, scene)) for name, scene in chosen.items()})
     code = publish(report, args)
     if report.settings["first_difference"] is not None:
         print(f"first difference: {report.settings['first_difference']}")

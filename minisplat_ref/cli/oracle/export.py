@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from minisplat_ref.arguments import Commands, HelpFormatter
-from minisplat_ref.cli.oracle import SURFELS_CALL, add_call_argument
+from minisplat_ref.cli.oracle import CALLS, add_call_argument, module_of
 
 DESCRIPTION = """\
 Write golden vectors: the inputs, outputs, cotangents and gradients of every
@@ -38,10 +38,10 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the folder and check it by reading it."""
-    if args.call == SURFELS_CALL:
-        from minisplat_ref.mechanisms.surfels.oracle import files
+    if args.call in CALLS:
+        from minisplat_ref.oracle import call_files
 
-        names = ", ".join(scene.name for scene in files.export(args.out))
+        names = ", ".join(scene.name for scene in call_files.export(module_of(args.call, "call").CALL, args.out))
         print(f"wrote {args.out}: scenes {names}; start with {args.out / 'README.md'}")
         return 0
     from minisplat_ref.oracle.golden.files import export, load

@@ -3,7 +3,7 @@
 import argparse
 
 from minisplat_ref.arguments import Commands, HelpFormatter
-from minisplat_ref.cli.oracle import SURFELS_CALL, add_call_argument, add_output_arguments, publish
+from minisplat_ref.cli.oracle import CALLS, add_call_argument, add_output_arguments, module_of, publish
 
 DESCRIPTION = """\
 Run the catalogue of hard cases through cpu float64, cpu-exact float32 and cpu
@@ -41,10 +41,9 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the cases, print the table and the worst of each kind."""
-    if args.call == SURFELS_CALL:
-        from minisplat_ref.mechanisms.surfels.oracle.hard_cases import run_surfel_cases, select
-
-        return publish(run_surfel_cases(select(args.only)), args)
+    if args.call in CALLS:
+        cases = module_of(args.call, "hard_cases")
+        return publish(cases.run_cases(cases.select(args.only)), args)
     from minisplat_ref.oracle.cases import as_markdown
     from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
     from minisplat_ref.oracle.hard_cases.run import by_group, run_hard_cases, select_cases

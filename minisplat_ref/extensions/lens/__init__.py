@@ -5,8 +5,8 @@ fisheye most of the image. This extension follows 3DGUT (Wu et al. 2025, arXiv 2
 drawn. It takes three ideas from it:
 
 - *Response*. A pixel meets a 3D Gaussian along its own true ray, ``alpha = o exp(-p . p / 2)`` with the ray's least
-  distance p in standard deviations (:mod:`.reference`). Footprints are exact whatever the lens does; the table of rays
-  is all that kernels know of it (:mod:`minisplat_ref.mechanisms.cameras`).
+  distance p in standard deviations (:mod:`minisplat_ref.mechanisms.cameras.ray_footprints`). Footprints are exact
+  whatever the lens does; the table of rays is all that kernels know of it (:mod:`minisplat_ref.mechanisms.cameras`).
 - *Bounds*. Seven sigma points of a Gaussian, projected by the lens, give mean and covariance of its bounds (unscented
   transform, alpha 0.1, beta 2, kappa 0).
 - *Order*. By the depths of the means: camera z, and for a fisheye the distance, since z ends at 90 degrees.
@@ -23,13 +23,14 @@ pixel may be missed by all rays.
     minisplat-ref train SCENE --recipe lens
     minisplat-ref train SCENE --extension lens --recipe 3dgs
     minisplat-ref study lens/footprints --out DIR
+    minisplat-ref study lens/fisheye --out DIR
     minisplat-ref oracle gradients --extension lens
 """
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
 from minisplat_ref.extensions.lens.stages import stages
-from minisplat_ref.studies.study import OUT, declare, number, seed
+from minisplat_ref.studies.study import OUT, RESUMED_OUT, declare, iterations, number, seed, seeds
 
 FOOTPRINTS = declare(
     "footprints",
@@ -39,4 +40,15 @@ FOOTPRINTS = declare(
     number("--gaussians", 20, "number of Gaussians"),
     seed("of the Gaussians"),
 )
-EXTENSION = Extension("lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages, studies=(FOOTPRINTS,))
+FISHEYE = declare(
+    "fisheye",
+    "a fisheye of 150 degrees as photographed and undistorted",
+    f"{__name__}.fisheye.run",
+    RESUMED_OUT,
+    number("--width", 160, "of the photographs, pixels; their height is 3/4 of it", minimum=16, metavar="W"),
+    iterations(1000),
+    seeds(3),
+)
+EXTENSION = Extension(
+    "lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages, studies=(FOOTPRINTS, FISHEYE)
+)

@@ -5,12 +5,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.lens.kernels import response_for
-from minisplat_ref.extensions.lens.reference import RESPONSE, FootprintGradient, LensFootprints, project, project_vjp
+from minisplat_ref.mechanisms.cameras.kernels import response_for
+from minisplat_ref.mechanisms.cameras.ray_footprints import (
+    RESPONSE,
+    FootprintGradient,
+    LensFootprints,
+    list_tiles,
+    project,
+    project_vjp,
+)
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
 from minisplat_ref.types import (
@@ -19,10 +26,8 @@ from minisplat_ref.types import (
     Ints,
     Model,
     Primitives,
-    Projection,
     RenderOutput,
     TileBins,
-    TileGrid,
     View,
 )
 
@@ -54,13 +59,6 @@ class Tape(NamedTuple):
     prepared: Prepared
     bins: TileBins
     output: RenderOutput
-
-
-def list_tiles(f: LensFootprints, camera: Camera, backend: Backend, conventions: Conventions) -> TileBins:
-    """Return the Gaussians of each of the backend's tiles, nearest means first."""
-    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
-    ordered = Projection(f.means2d, f.depths, np.zeros((len(f.depths), 3)), f.opacities, f.radii, f.boxes)
-    return REFERENCE.bin_gaussians(ordered, grid, conventions)
 
 
 def prepare(model: Model, camera: Camera, request: Request) -> Prepared:
@@ -95,7 +93,8 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Ta
     Raises
     ------
     InputError
-        Something is wanted that needs an image without distortion, or :func:`.reference.project` refuses the camera.
+        Something is wanted that needs an image without distortion, or the camera is refused by
+        :func:`~minisplat_ref.mechanisms.cameras.ray_footprints.project`.
     """
     if request.wants - WANTS:
         names = ", ".join(sorted(request.wants - WANTS))

@@ -4,8 +4,8 @@ import numpy as np
 
 from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
-from minisplat_ref.extensions.lens.reference import RESPONSE
 from minisplat_ref.extensions.lens.renderer import prepare
+from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting

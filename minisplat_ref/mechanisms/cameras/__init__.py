@@ -4,6 +4,8 @@ A :class:`~minisplat_ref.types.Camera` says in its ``optics`` what it does to di
 returns the :class:`~.models.CameraModel` of it: perspective, Brown's distortion, Kannala and Brandt's fisheye, or
 orthographic. In the order of use: :mod:`.distortion` (what a lens does to a direction, and the inverse),
 :mod:`.models` (the cameras), :mod:`.unscented` (the bounds of a Gaussian in the image of any camera), :mod:`.affine`
-(cameras without perspective, whose projection of a Gaussian is exact, for the conic kernels). Kernels read rays from
-the table of :func:`~.models.ray_table`, so no kernel depends on a camera's formula.
+(cameras without perspective, whose projection of a Gaussian is exact, for the conic kernels), :mod:`.ray_footprints`
+and :mod:`.kernels` (3D Gaussians met by a camera's true rays), :mod:`.gsplat_call` (gsplat's call with these cameras),
+and :mod:`.oracle` for that call. Kernels read rays from the table of :func:`~.models.ray_table`, so no kernel depends
+on a camera's formula.
 """

@@ -140,7 +140,7 @@ def arguments_of(case: HardCase, dtype: str) -> dict[str, Any]:
     }
 
 
-def run_surfel_cases(cases: Sequence[HardCase] = CASES, backends: Sequence[str] = ("reference", "cpu")) -> Report:
+def run_cases(cases: Sequence[HardCase] = CASES, backends: Sequence[str] = ("reference", "cpu")) -> Report:
     """Run cases through backends in float64, and through the kernels in float32 too."""
     found = []
     for case in cases:

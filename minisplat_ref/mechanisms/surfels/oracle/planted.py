@@ -1,25 +1,16 @@
 """Errors planted in ``rasterization_2dgs``, each at one step of the call, to see where a comparison finds it."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.surfels.gsplat_call import Steps
 from minisplat_ref.mechanisms.surfels.projection import Surfels
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.renderer import Shown
+from minisplat_ref.oracle.call_comparison import PlantedInCall
 from minisplat_ref.types import Floats, RenderOutput
-
-
-class Planted(NamedTuple):
-    """An error."""
-
-    what: str
-    stage: str
-    """Where it has to be found: the name of a stage in :data:`.comparison.STAGES`."""
-    plant: Callable[[Steps], Steps]
 
 
 def _projected(change: Callable[..., Surfels]) -> Callable[[Steps], Steps]:
@@ -125,47 +116,34 @@ def _forward_differences(depth: Floats, camera: Any) -> Floats:
     return normals
 
 
-PLANTED: Mapping[str, Planted] = {
-    "projected-center": Planted("low-pass at the projected centre", "projection", _projected(_projected_centers)),
-    "three-sigma": Planted("radii of 3 standard deviations", "projection", _projected(_three_sigma)),
-    "no-principal-point": Planted("rays without c_x", "projection", _projected(_without_principal_point)),
-    "unturned-normals": Planted("normals not turned to the camera", "projection", _projected(_unturned)),
-    "moved-low-pass": Planted("low-pass 0.3 px off", "alpha", _shown(_moved_low_pass)),
-    "clamp-0.99": Planted("alpha clamped at 0.99", "alpha", _shown(_clamp_sooner)),
-    "depth-not-divided": Planted(
+PLANTED: Mapping[str, PlantedInCall] = {
+    "projected-center": PlantedInCall("low-pass at the projected centre", "projection", _projected(_projected_centers)),
+    "three-sigma": PlantedInCall("radii of 3 standard deviations", "projection", _projected(_three_sigma)),
+    "no-principal-point": PlantedInCall("rays without c_x", "projection", _projected(_without_principal_point)),
+    "unturned-normals": PlantedInCall("normals not turned to the camera", "projection", _projected(_unturned)),
+    "moved-low-pass": PlantedInCall("low-pass 0.3 px off", "alpha", _shown(_moved_low_pass)),
+    "clamp-0.99": PlantedInCall("alpha clamped at 0.99", "alpha", _shown(_clamp_sooner)),
+    "depth-not-divided": PlantedInCall(
         "accumulated depth for the expected one",
         "colours and expected depth",
         lambda steps: steps._replace(expect=lambda sums, alpha: sums),
     ),
-    "unit-normals": Planted("blended normals of length one", "normals", _blended(_scaled_normals)),
-    "mean-for-median": Planted(
+    "unit-normals": PlantedInCall("blended normals of length one", "normals", _blended(_scaled_normals)),
+    "mean-for-median": PlantedInCall(
         "mean depth for the median",
         "median depth",
         _measured(lambda m: m._replace(median=m.depth_sums / np.maximum(m.alpha, 1e-12))),
     ),
-    "half-distortion": Planted(
+    "half-distortion": PlantedInCall(
         "distortion over pairs i < j", "distortion", _measured(lambda m: m._replace(distortion=m.distortion / 2))
     ),
-    "forward-differences": Planted(
+    "forward-differences": PlantedInCall(
         "surface normals by forward differences",
         "surface normals",
         lambda steps: steps._replace(normals_of=_forward_differences),
     ),
-    "no-low-pass-gradient": Planted("no gradient via the low-pass", "gradients", _no_low_pass_gradient),
-    "no-distortion-gradient": Planted("no gradient of the distortion", "gradients", _no_distortion_gradient),
-    "no-median-gradient": Planted("no gradient of the median depth", "gradients", _no_median_gradient),
+    "no-low-pass-gradient": PlantedInCall("no gradient via the low-pass", "gradients", _no_low_pass_gradient),
+    "no-distortion-gradient": PlantedInCall("no gradient of the distortion", "gradients", _no_distortion_gradient),
+    "no-median-gradient": PlantedInCall("no gradient of the median depth", "gradients", _no_median_gradient),
 }
 """The errors by name."""
-
-
-def planted_steps(name: str) -> Steps:
-    """Return the steps of the call with one error.
-
-    Raises
-    ------
-    InputError
-        There is none of that name.
-    """
-    if name not in PLANTED:
-        raise InputError(f"error {name!r} is unknown; choose one of {', '.join(PLANTED)}")
-    return PLANTED[name].plant(Steps())

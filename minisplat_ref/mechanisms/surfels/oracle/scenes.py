@@ -6,31 +6,20 @@ surfels: discs seen from the edge, at a grazing angle, behind the camera and acr
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.mechanisms.surfels.gsplat_call import NAMES, rasterization_2dgs
+from minisplat_ref.oracle.call_comparison import CallScene
 from minisplat_ref.types import Floats
 
 SIZE = (44, 36)  # px
 INTRINSICS = ((41.5, 0.0, 20.3), (0.0, 38.25, 19.1), (0.0, 0.0, 1.0))
-LEAVES = ("means", "quats", "scales", "opacities", "colors")
+LEAVES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 
 
-class SurfelScene(NamedTuple):
-    """A call and what its images are differentiated along."""
-
-    name: str
-    what: str
-    """One line: what it is for."""
-    arguments: dict[str, Any]
-    """Of the call: arrays in float64, and settings."""
-    cotangents: dict[str, Floats]
-    """``v_render_colors`` and so on."""
-
-
-def scenes() -> tuple[SurfelScene, ...]:
+def scenes() -> tuple[CallScene, ...]:
     """Return the scenes."""
     return (
         _scene("ordinary", "dense, opaque in places; expected depth", 0, *_ordinary(60, 0)),
@@ -46,7 +35,7 @@ def _scene(
     surfels: dict[str, Floats],
     viewmat: Floats,
     depth_mode: str = "expected",
-) -> SurfelScene:
+) -> CallScene:
     rng = np.random.default_rng(100 + seed)
     n = len(surfels["means"])
     arguments: dict[str, Any] = {
@@ -66,7 +55,7 @@ def _scene(
     cotangents = {
         f"v_{key}": _round(rng.normal(size=np.shape(image))) for key, image in zip(NAMES, images, strict=True)
     }
-    return SurfelScene(name, what, arguments, cotangents)
+    return CallScene(name, what, arguments, cotangents)
 
 
 def _ordinary(n: int, seed: int) -> tuple[dict[str, Floats], Floats]:

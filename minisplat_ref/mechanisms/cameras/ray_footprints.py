@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
@@ -26,7 +27,8 @@ from minisplat_ref.reference.covariance import rotation_matrices, rotation_matri
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.reference.pinhole import pose, with_principal_point
-from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives
+from minisplat_ref.reference.tiling import bin_gaussians
+from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives, Projection, TileBins, TileGrid
 
 WHITENESS_MAX = 1e12  # of |x| / s: its square is far from the end of float32
 
@@ -218,6 +220,13 @@ def hit_vjp(
 def boxes_of(footprints: LensFootprints) -> Ints:
     """Return the boxes [N, 4] outside of which nothing is hit."""
     return footprints.boxes
+
+
+def list_tiles(f: LensFootprints, camera: Camera, backend: Backend, conventions: Conventions) -> TileBins:
+    """Return the Gaussians of each of the backend's tiles, nearest means first."""
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    ordered = Projection(f.means2d, f.depths, np.zeros((len(f.depths), 3)), f.opacities, f.radii, f.boxes)
+    return bin_gaussians(ordered, grid, conventions)
 
 
 RESPONSE = Response(boxes_of, hit, hit_vjp, ("positions", "whitenings", "opacities"))

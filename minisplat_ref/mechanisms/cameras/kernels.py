@@ -16,10 +16,10 @@ import numpy as np
 
 from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.extensions.lens.reference import LensFootprints, boxes_of
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
+from minisplat_ref.mechanisms.cameras.ray_footprints import LensFootprints, boxes_of
 from minisplat_ref.types import Floats
 
 # Columns of a record, and of its gradient.

@@ -1,0 +1,98 @@
+"""The oracle for ``rasterization`` with other cameras: planted errors, hard cases, golden vectors, a function."""
+
+import json
+
+import numpy as np
+import pytest
+
+from minisplat_ref.cli import main
+from minisplat_ref.mechanisms.cameras.oracle.call import CALL, STAGES
+from minisplat_ref.mechanisms.cameras.oracle.hard_cases import CASES, run_cases, select
+from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED
+from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
+
+OF_CAMERAS = ["--call", "rasterization_cameras"]
+
+
+@pytest.fixture(scope="module")
+def known():
+    return {scene.name: (scene, truth(CALL, scene)) for scene in CALL.scenes()}
+
+
+@pytest.mark.parametrize("error", PLANTED)
+def test_a_planted_error_is_named_at_its_stage(error, known):
+    report = compare(CALL, choose_renderer(CALL, f"planted:{error}"), known)
+    assert report.settings["first_difference"].partition(":")[0] == PLANTED[error].stage
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_kernels_agree_at_every_stage(dtype, known):
+    report = compare(CALL, choose_renderer(CALL, "cpu", dtype), known)
+    assert len(report.cases) == len(STAGES) and report.n_failed == 0, report.cases
+    assert report.settings == {"first_difference": None, "not_given": []}
+
+
+def test_the_scenes_hold_what_they_say(known):
+    """Something is seen beyond 90 degrees, something is culled, and lenses and parallel rays cover their images."""
+    scene, arrays = known["fisheye"]
+    view = scene.arguments["viewmats"][0]
+    z = scene.arguments["means"] @ view[2, :3] + view[2, 3]
+    assert ((arrays["radii"][0, :, 0] > 0) & (z < 0)).sum() > 10
+    for name, (_, of_scene) in known.items():
+        assert (of_scene["radii"][..., 0] == 0).any(), name
+        assert of_scene["render_alphas"].mean() > 0.1, name
+        assert min(np.abs(of_scene[key]).max() for key in STAGES if key.startswith("v_")) > 1e-3, name
+
+
+def test_hard_cases_have_the_answers_that_were_worked_out():
+    report = run_cases()
+    assert len(report.cases) == 3 * len(CASES) and report.n_failed == 0, report.cases
+
+
+def test_a_wrong_answer_is_found():
+    (case,) = select("beyond 90")
+    wrong = case._replace(alphas={pixel: value + 1e-3 for pixel, value in case.alphas.items()})
+    assert run_cases((wrong,)).n_failed == 3
+
+
+def test_golden_vectors_and_a_renderer_of_ones_own(tmp_path, capsys, monkeypatch):
+    """Export, compare the folder with itself, and a function that gets gsplat's keywords, by the command line."""
+    golden = tmp_path / "golden"
+    assert main(["oracle", "export", str(golden), *OF_CAMERAS]) == 0
+    assert {"README.md", "manifest.json", *("brown", "fisheye", "hard", "ortho")} == {p.name for p in golden.iterdir()}
+    manifest = json.loads((golden / "manifest.json").read_text())
+    assert manifest["call"] == "rasterization_cameras"
+    assert manifest["scenes"]["fisheye"]["settings"]["camera_model"] == "fisheye"
+    compared = ["oracle", "compare", str(golden), *OF_CAMERAS, "--dtype", "float64"]
+    assert main(compared) == 0 and "all 12 cases passed" in capsys.readouterr().out
+
+    with np.load(golden / "brown" / "results.npz") as file:
+        arrays = dict(file)
+    arrays["depths"] = arrays["depths"] + 0.01
+    np.savez(golden / "brown" / "results.npz", **arrays)
+    assert main(compared) == 1 and "first difference: projection: depths" in capsys.readouterr().out
+
+    (tmp_path / "my_lens.py").write_text(
+        "from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization as theirs, rasterization_vjp\n"
+        "def rasterization(*, with_ut=False, with_eval3d=False, camera_model='pinhole', **arguments):\n"
+        "    assert with_ut == with_eval3d == (camera_model != 'ortho')\n"
+        "    return theirs(with_ut=with_ut, with_eval3d=with_eval3d, camera_model=camera_model, **arguments)[:2]\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert main(["oracle", "compare", "my_lens:rasterization", *OF_CAMERAS]) == 0
+    out = capsys.readouterr().out
+    assert "all 9 cases passed" in out and "not given: means2d, depths, radii" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare", "cpu", "--scene", "sh3"], "choose all or one of brown, fisheye, hard, ortho"),
+        (["compare", "planted:nothing"], "error 'nothing' is unknown"),
+        (["compare", "gsplat-torch"], "nor a renderer of other cameras: package.module:function, cpu, cpu-exact,"),
+        (["hard-cases", "--only", "needle"], "no hard case holds 'needle'"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, capsys):
+    assert main(["oracle", *arguments, *OF_CAMERAS]) == 2
+    assert message in capsys.readouterr().err
