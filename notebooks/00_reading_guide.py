@@ -152,6 +152,7 @@ notes = {
     "cli": "arguments, progress, files",
     "bench": "speed beside error",
     "comparison": "recipes side by side",
+    "viewer": "a scene in the browser",
     "runs": "a training and its folder",
     "warm_up": "kernels ahead of their use",
     "testing": "the oracle for other tests",
