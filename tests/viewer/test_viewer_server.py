@@ -126,6 +126,7 @@ def test_a_layer_that_cannot_be_drawn_says_why(server):
     with connected(server) as client:
         until(viewer, client, full(client))
         client.change("layer", "importance")
+        client.images.clear()
         until(viewer, client, lambda m: said(m, "renderer bare gives no blend statistics"))
         until(viewer, client, full(client))
 
