@@ -96,9 +96,9 @@ def _is_other(*defaults: Any) -> Callable[[Any], bool]:
 
 _UNDISTORTED = "undistort the photographs, as minisplat-ref undistort does"
 _IMAGE_PLANE = "Gaussians are projected by the Jacobian, and blended in the image: leave it out"
-_CAMERAS = "call minisplat_ref.mechanisms.cameras.gsplat_call.rasterization, which computes it"
+_CAMERAS = "call mechanisms.cameras.gsplat_call"
 REFUSED: Mapping[str, Refused] = {
-    "camera_model": Refused(_is_other("pinhole"), f"give 'pinhole', or {_CAMERAS}"),
+    "camera_model": Refused(_is_other("pinhole"), f"only pinhole; for fisheye and ortho {_CAMERAS}"),
     "sparse_grad": Refused(_is_true, "gradients are dense arrays, of the same values: leave it out"),
     "absgrad": Refused(_is_true, "sums of absolute gradients are not kept: leave it out"),
     "distributed": Refused(_is_true, "there is one process: leave it out, and give all Gaussians"),

@@ -168,7 +168,7 @@ def test_camera_center_is_where_the_camera_maps_to_0(rng):
     assert camera.center.dtype == np.float64
     single = camera.astype(np.float32)
     assert single.center.dtype == single.cam_from_world_R.dtype == single.cam_from_world_t.dtype == np.float32
-    assert single[2:] == camera[2:8] and camera.cam_from_world_R.dtype == np.float64
+    assert single[2:] == camera[2:] and camera.cam_from_world_R.dtype == np.float64
     assert_array_equal(single.astype(np.float64).cam_from_world_t, camera.cam_from_world_t.astype(np.float32))
 
 
