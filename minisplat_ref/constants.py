@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 # Spherical harmonics: real, orthonormal, with the Condon-Shortley sign (the order and signs of the 3DGS PLY files).
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
+LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601: shares of R', G' and B' in the luminance
 SH_C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
 SH_C2 = (
     1.0925484305920792,  # sqrt(15 / (4 pi))

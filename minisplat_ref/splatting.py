@@ -101,8 +101,7 @@ def splat(
     projection = backend.project(*primitives, camera, conventions)
     channels = shade(projection.radii)  # [N, D]
     if with_depth:
-        channels = np.column_stack([channels, projection.depths])  # [N, D + 1]
-        background = np.append(background, background.dtype.type(0))
+        channels, background = append_depths(channels, background, projection.depths)
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(projection, grid, conventions)
     output = backend.composite(
@@ -111,6 +110,12 @@ def splat(
     return SplatTape(
         primitives, camera, conventions, backend, projection, channels, background, with_depth, bins, output
     )
+
+
+def append_depths(channels: Floats, background: Floats, depths: Floats) -> tuple[Floats, Floats]:
+    """Return channels [N, D + 1] and a background [D + 1] with depths [N] as the last channel, behind which is 0."""
+    with_depths = np.column_stack([channels, depths.astype(channels.dtype)])
+    return with_depths, np.append(background, background.dtype.type(0))
 
 
 def splat_vjp(tape: SplatTape, v_image: Floats, v_alpha: Floats) -> SplatGradient:

@@ -62,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.reports.commands import command
     from minisplat_ref.runs import run_folder, settings
 
-    folder = args.out or Path("splats") / args.photos.resolve().with_suffix("").name
+    path = args.photos.resolve()
+    folder = args.out or Path("splats") / (path.stem if is_video(path) else path.name)
     scene, trained, film = (folder / name for name in (SCENE, RUN, FILM))
     if not args.photos.is_dir() and not is_video(args.photos):
         raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")

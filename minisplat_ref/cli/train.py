@@ -109,7 +109,7 @@ def add_parser(commands: Commands) -> None:
         metavar="R",
         help="adaptive (default), 3dgs[-accel], mini-splatting[2][-d]",
     )
-    training.add_argument("--config", type=Path, metavar="JSON", help="run, or its config.json, whose settings to take")
+    training.add_argument("--config", type=Path, metavar="RUN", help="run, or its config.json, whose settings to take")
     training.add_argument("--init", type=Path, metavar="START", help="points (PLY) or run to start from")
     training.add_argument(
         "--iterations",

@@ -17,7 +17,7 @@ UNREAD_SUFFIXES = (
     *(".avif", ".jxl"),
     *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
 )
-"""Formats of cameras that are not decoded."""
+"""Formats of cameras that are not read."""
 MASKS = "masks"
 """Folder of masks beside the photographs."""
 SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
@@ -45,7 +45,8 @@ def list_images(folder: Path) -> list[Path]:
     files = [folder / file for file in photos if file.suffix.lower() in suffixes]
     others = [str(file) for file in photos if file.suffix.lower() in UNREAD_SUFFIXES]
     problems = []
-    if heif := [str(file) for file in photos if file.suffix.lower() in HEIF_SUFFIXES and folder / file not in files]:
+    heif = [str(file) for file in photos if file.suffix.lower() in set(HEIF_SUFFIXES) - set(suffixes)]
+    if heif:
         problems.append(f"{len(heif)} HEIC photographs ({enumerate_names(heif)}): pip install 'minisplat_ref[heic]'")
     if others:
         problems.append(

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from tqdm import tqdm
 
+from minisplat_ref.constants import LUMA
 from minisplat_ref.errors import InputError, one_line
 from minisplat_ref.io.images import DAMAGE_ERRORS, write_image
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".gif")
 SECONDS = 0.5  # of a video, from which one frame is kept
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def is_video(path: Path) -> bool:
@@ -64,7 +64,7 @@ def keep_sharpest(video: Path, folder: Path, every: int | None = None) -> list[P
 
 def sharpness(frame: NDArray[np.uint8]) -> float:
     """Return the mean square of the Laplacian of the brightness of a frame [H, W, 3]."""
-    return float(np.mean(ndimage.laplace(frame.astype(np.float32) @ LUMA) ** 2))
+    return float(np.mean(ndimage.laplace(frame.astype(np.float32) @ np.array(LUMA, np.float32)) ** 2))
 
 
 def _write(folder: Path, best: tuple[float, int, NDArray[np.uint8]]) -> Path:

@@ -81,7 +81,7 @@ ADAM = StageTolerance(COMPARE_FLOAT64, 2e-6, "a few roundings of each value")
 SURFEL_DEPTH = StageTolerance(COMPARE_FLOAT64, 5e-5, "a depth is divided by alpha, hundreds of hits each rounded")
 SURFEL_DISTORTION = StageTolerance(COMPARE_FLOAT64, 2e-4, "z_i A_i - M_i is a difference of nearly equal numbers")
 SURFEL_NORMAL = StageTolerance(COMPARE_FLOAT64, 2e-3, "differences of neighbouring depths, divided by their length")
-SURFEL_HARD = StageTolerance(1e-10, 2e-5, "grazing rays multiply rounding by the inverse of the angle")
+CALL_HARD = StageTolerance(1e-10, 2e-5, "grazing rays multiply rounding by the inverse of the angle")
 
 # Of two weights in a pixel that are as near as this part of the larger, rounding decides which is the largest: they are
 # products of hundreds of factors, each rounded to 6e-8.

@@ -1,11 +1,13 @@
 """``photos``: from photographs to a report and a film, what it prints, and that it continues."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from minisplat_ref.cli import main
+from minisplat_ref.cli import photos as photos_command
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.runs.proposed_size import comfortable_factor
@@ -65,6 +67,17 @@ def test_a_folder_that_is_not_there(tmp_path, capsys):
     assert photos(tmp_path / "out") == 2
     assert "is no folder: give the folder of your photographs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("name", "folder"), [("trip.2024", "trip.2024"), ("walk.mp4", "walk")])
+def test_results_are_named_after_the_folder_or_the_video(name, folder, tmp_path, monkeypatch):
+    """The point in a folder's name begins no suffix."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_bytes(b"") if name.endswith(".mp4") else (tmp_path / name).mkdir()
+    asked = []
+    monkeypatch.setattr(photos_command, "_do", lambda *words: asked.append(words) or 1)
+    assert main(["photos", name, "--downscale", "1"]) == 1
+    assert asked[0][:4] == ("sfm", Path(name), "--out", Path("splats") / folder / "scene")
 
 
 @pytest.mark.parametrize(

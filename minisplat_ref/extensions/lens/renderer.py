@@ -20,6 +20,7 @@ from minisplat_ref.mechanisms.cameras.ray_footprints import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
+from minisplat_ref.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -71,8 +72,7 @@ def prepare(model: Model, camera: Camera, request: Request) -> Prepared:
     channels = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, footprints.radii)
     has_depth = "depth" in request.wants
     if has_depth:
-        channels = np.column_stack([channels, footprints.depths.astype(dtype)])
-        background = np.append(background, dtype.type(0))
+        channels, background = append_depths(channels, background, footprints.depths)
     return Prepared(
         g,
         degree,

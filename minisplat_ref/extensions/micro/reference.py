@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import sobel
 
+from minisplat_ref.constants import LUMA
 from minisplat_ref.types import Bools, Floats, Ints
 
-LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601: the luminance of R'G'B'
 SOBEL_SUM = 8.0  # a ramp of one unit per pixel gives this
 
 
@@ -68,7 +68,7 @@ def detail_map(photograph: NDArray) -> Floats:
     photograph : ndarray of shape (H, W, 3)
         RGB in any unit; gamma-encoded, as photographs are.
     """
-    luminance = photograph @ LUMA
+    luminance = photograph @ np.array(LUMA)
     g = np.hypot(sobel(luminance, axis=0), sobel(luminance, axis=1)) / SOBEL_SUM  # [H, W] per pixel
     mean = g.mean()
     return g / mean if mean > 0 else np.ones_like(g)

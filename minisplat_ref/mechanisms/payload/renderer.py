@@ -28,6 +28,7 @@ from minisplat_ref.rendering import (
     activate_vjp,
     choose_degree,
 )
+from minisplat_ref.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -173,8 +174,7 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     listed = payload.listed(footprints)
     channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, listed.radii)  # [N, 3]
     if "depth" in request.wants:
-        channels = np.column_stack([channels, listed.depths])
-        background = np.append(background, background.dtype.type(0))
+        channels, background = append_depths(channels, background, listed.depths)
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(listed, grid, conventions)
     blended = footprints, payload.coefficients(projected, channels), background, bins

@@ -22,6 +22,7 @@ from minisplat_ref.reference.compositing import composite_hits, composite_hits_v
 from minisplat_ref.reference.hits import Response
 from minisplat_ref.reference.removal import removal_changes_of_hits
 from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
+from minisplat_ref.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -112,8 +113,7 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
     channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, footprints.radii)
     has_depth = "depth" in request.wants
     if has_depth:
-        channels = np.column_stack([channels, footprints.depths.astype(dtype)])
-        background = np.append(background, dtype.type(0))
+        channels, background = append_depths(channels, background, footprints.depths)
     return Prepared(
         g,
         sh_degree,

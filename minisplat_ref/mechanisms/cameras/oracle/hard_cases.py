@@ -6,16 +6,14 @@ g is less than 90 degrees. All images and gradients have to be finite.
 """
 
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.oracle.scenes import ALONG_RAYS
-from minisplat_ref.oracle.cases import Case, Figure, Report
-from minisplat_ref.oracle.tolerances import SURFEL_HARD
+from minisplat_ref.oracle import call_cases
+from minisplat_ref.oracle.cases import Report
 
 SIZE, CENTER = 32, 16  # px; the principal point is (16.5, 16.5): the centre of pixel (16, 16) is on the axis
 PINHOLE = {"focal": 32.0, **ALONG_RAYS}
@@ -101,17 +99,8 @@ CASES = (
 
 
 def select(pattern: str) -> tuple[HardCase, ...]:
-    """Return the cases whose name holds a pattern, in which * and ? are wildcards.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    found = tuple(case for case in CASES if fnmatchcase(case.name, f"*{pattern}*"))
-    if not found:
-        raise InputError(f"no hard case holds {pattern!r}: there are {', '.join(case.name for case in CASES)}")
-    return found
+    """Return the cases whose name holds a pattern; see :func:`minisplat_ref.oracle.call_cases.select`."""
+    return call_cases.select(CASES, pattern)
 
 
 def arguments_of(case: HardCase, dtype: str) -> dict[str, Any]:
@@ -133,24 +122,16 @@ def arguments_of(case: HardCase, dtype: str) -> dict[str, Any]:
     }
 
 
-def run_cases(cases: Sequence[HardCase] = CASES, backends: Sequence[str] = ("reference", "cpu")) -> Report:
-    """Run cases through backends in float64, and through the kernels in float32 too."""
-    found = []
-    for case in cases:
-        for backend in backends:
-            for dtype in ("float64",) if backend == "reference" else ("float64", "float32"):
-                found.append(_run(case, backend, dtype))
-    return Report("hard cases of rasterization_cameras", tuple(found), {"backends": list(backends)})
+def run_cases(cases: Sequence[HardCase] = CASES) -> Report:
+    """Run cases; see :func:`minisplat_ref.oracle.call_cases.run_cases`."""
+    return call_cases.run_cases("rasterization_cameras", _run, cases)
 
 
-def _run(case: HardCase, backend: str, dtype: str) -> Case:
+def _run(case: HardCase, backend: str, dtype: str) -> tuple[float, bool]:
     arguments = arguments_of(case, dtype)
     image, alpha, _ = rasterization(**arguments, backend=backend)
     ones: dict[str, Any] = {"v_render_colors": np.ones_like(image), "v_render_alphas": np.ones_like(alpha)}
     gradients = rasterization_vjp(**arguments, **ones, backend=backend)
     is_finite = all(np.isfinite(array).all() for array in (image, alpha, *gradients.values()))
     error = max(abs(float(alpha[0, row, column, 0]) - value) for (row, column), value in case.alphas.items())
-    limit = SURFEL_HARD.of(dtype)
-    figures: dict[str, Figure] = {"largest error": error, "limit": limit}
-    note = "" if is_finite else "an image or a gradient is not finite"
-    return Case(f"{case.name}: {backend} {dtype}", is_finite and error <= limit, figures, note)
+    return error, is_finite

@@ -6,15 +6,13 @@ gsplat skips a hit whose p_2 is 0 exactly, and we leave the low-pass, which is t
 """
 
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.surfels.gsplat_call import NAMES, rasterization_2dgs, rasterization_2dgs_vjp
-from minisplat_ref.oracle.cases import Case, Figure, Report
-from minisplat_ref.oracle.tolerances import SURFEL_HARD
+from minisplat_ref.oracle import call_cases
+from minisplat_ref.oracle.cases import Report
 from minisplat_ref.types import Floats
 
 SIZE = 32  # px
@@ -107,17 +105,8 @@ CASES = (
 
 
 def select(pattern: str) -> tuple[HardCase, ...]:
-    """Return the cases whose name holds a pattern, in which * and ? are wildcards.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    found = tuple(case for case in CASES if fnmatchcase(case.name, f"*{pattern}*"))
-    if not found:
-        raise InputError(f"no hard case holds {pattern!r}: there are {', '.join(case.name for case in CASES)}")
-    return found
+    """Return the cases whose name holds a pattern; see :func:`minisplat_ref.oracle.call_cases.select`."""
+    return call_cases.select(CASES, pattern)
 
 
 def arguments_of(case: HardCase, dtype: str) -> dict[str, Any]:
@@ -140,17 +129,12 @@ def arguments_of(case: HardCase, dtype: str) -> dict[str, Any]:
     }
 
 
-def run_cases(cases: Sequence[HardCase] = CASES, backends: Sequence[str] = ("reference", "cpu")) -> Report:
-    """Run cases through backends in float64, and through the kernels in float32 too."""
-    found = []
-    for case in cases:
-        for backend in backends:
-            for dtype in ("float64",) if backend == "reference" else ("float64", "float32"):
-                found.append(_run(case, backend, dtype))
-    return Report("hard cases of rasterization_2dgs", tuple(found), {"backends": list(backends)})
+def run_cases(cases: Sequence[HardCase] = CASES) -> Report:
+    """Run cases; see :func:`minisplat_ref.oracle.call_cases.run_cases`."""
+    return call_cases.run_cases("rasterization_2dgs", _run, cases)
 
 
-def _run(case: HardCase, backend: str, dtype: str) -> Case:
+def _run(case: HardCase, backend: str, dtype: str) -> tuple[float, bool]:
     arguments = arguments_of(case, dtype)
     images = dict(zip(NAMES, rasterization_2dgs(**arguments, backend=backend)[:6], strict=True))
     cotangents = {f"v_{name}": np.ones_like(image) for name, image in images.items()}
@@ -161,10 +145,7 @@ def _run(case: HardCase, backend: str, dtype: str) -> Case:
         *_errors(images["render_alphas"], case.alphas),
         *_errors(images["render_median"], case.medians),
     ]
-    error, limit = max(errors), SURFEL_HARD.of(dtype)
-    figures: dict[str, Figure] = {"largest error": error, "limit": limit}
-    note = "" if is_finite else "an image or a gradient is not finite"
-    return Case(f"{case.name}: {backend} {dtype}", is_finite and error <= limit, figures, note)
+    return max(errors), is_finite
 
 
 def _errors(images: Any, known: Mapping[tuple[int, int], float]) -> list[float]:
