@@ -48,7 +48,7 @@ _CALL = (
     PlantedLine(
         "camera's centre by the transpose", "gsplat_compat:remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"
     ),
-    PlantedLine("depths over white", "splatting:splat", "background.dtype.type(0)", "background.dtype.type(1)"),
+    PlantedLine("depths over white", "splatting:append_depths", "background.dtype.type(0)", "background.dtype.type(1)"),
     PlantedLine(
         "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"
     ),
