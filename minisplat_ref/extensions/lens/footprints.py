@@ -116,6 +116,7 @@ def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
     for axes, (kind, errors) in zip(figure.subplots(1, 2, sharey=True), found.items(), strict=True):
         for name, values in errors.items():
             axes.plot(ANGLES[kind], values, "o-", color=COLORS[name], label=name)
-        axes.set(title=f"Error of the footprint, {kind}", xlabel="degrees off the axis", ylim=(0, None))
+        axes.set(title=f"Error of the footprint, {kind}", xlabel="degrees off the axis")
+    axes.set_ylim(bottom=0)  # last, as it ends the scaling of both panels
     axes.legend()
     return figure

@@ -245,7 +245,8 @@ def draw(records: list[dict[str, Any]]) -> Figure:
         for loss in LOSSES:
             paths = [record["paths"] for record in records if record["arm"] == f"{camera}, {loss}"]
             ax.plot(TIMES, np.mean(paths, axis=0), marker="o", label=loss)
-        ax.set(title=f"{camera} camera", xlabel="time", ylim=(0, None))
+        ax.set(title=f"{camera} camera", xlabel="time")
+    ax.set_ylim(bottom=0)  # last, as it ends the scaling of both panels
     ax.legend()
     figure.axes[0].set_ylabel("error of the centres, pixels")
     return figure
