@@ -150,6 +150,7 @@ ORDER = (
                 (21,),
                 "discs with depths and normals; from depth maps to a mesh",
             ),
+            Step(("extensions/games/",), (), "Gaussians that are trained on the faces of a mesh"),
             Step(
                 (
                     "mechanisms/gbuffer/",

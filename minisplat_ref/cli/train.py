@@ -288,14 +288,12 @@ def _default_iterations(name: str) -> int:
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from what --init gives."""
     from minisplat_ref.runs.start import start_from
-    from minisplat_ref.training.initial_state import initial_state
 
-    if settings.init is None:
-        return initial_state(scene, recipe, settings.seed)
     start = start_from(settings.init, scene, recipe, settings.seed)
     for notice in start.notices:
         print(f"minisplat-ref: {notice}", file=sys.stderr)
-    print(f"starts from {start.source}")
+    if start.source is not None:
+        print(f"starts from {start.source}")
     return start.state
 
 

@@ -11,7 +11,6 @@ from minisplat_ref.io.frames import place_scene
 from minisplat_ref.lpips import check_views, load_network
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.start import start_from
-from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
 
@@ -148,10 +147,7 @@ def check(plan: Plan) -> Scene:
     if plan.lpips_weights is not None:
         check_views(load_network(plan.lpips_weights), scene.test_views)
     for recipe in recipes:
-        if plan.init is None:
-            initial_state(scene, recipe, seed=0)
-        else:
-            start_from(plan.init, scene, recipe, seed=0)
+        start_from(plan.init, scene, recipe, seed=0)
     return scene
 
 

@@ -1,5 +1,6 @@
 """What a training starts from in place of the scene's own points: a point cloud, or the model of a run (``--init``)."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,19 +27,20 @@ class Start(NamedTuple):
     """The state before the first iteration of a training that is given what to start from."""
 
     state: TrainState
-    source: str
-    """What it starts from, in one line."""
+    source: str | None
+    """What it starts from, in one line; None for the scene's own points."""
     notices: list[str]
     """Sentences on what the source lacks."""
 
 
-def start_from(path: str | Path, scene: Scene, recipe: Recipe, seed: int) -> Start:
-    """Return the start from a point cloud, or from the model of a run where the path is a folder.
+def start_from(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int) -> Start:
+    """Return the start from the scene's points, a file, or the model of a run where the path is a folder.
 
     Parameters
     ----------
-    path : str or Path
-        See :func:`load_start` and :func:`continue_model`.
+    path : str or Path, optional
+        See :func:`load_start` and :func:`continue_model`; some representations read files of their own. By default the
+        scene's own points.
     scene : Scene
     recipe : Recipe
     seed : int
@@ -47,11 +49,22 @@ def start_from(path: str | Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
     Raises
     ------
     InputError
-        The path holds neither, or it does not fit the scene or the recipe.
+        The path holds neither, it does not fit the scene or the recipe, or there is none and the recipe needs one.
     """
+    from_file = recipe.representation.from_file
+    if path is None:
+        if from_file is not None:
+            raise InputError(
+                f"recipe {recipe.name} trains {recipe.representation.name}, which do not start from the scene's points:"
+                " give --init FILE, or a run of that recipe"
+            )
+        return Start(initial_state(scene, recipe, seed), None, [])
     recipe = recipe._replace(starts_densely=False)  # from these points, as asked
     if Path(path).is_dir():
         return continue_model(Path(path), scene, recipe, seed)
+    if from_file is not None:
+        state = initial_state(scene, recipe, seed, partial(from_file, Path(path), scene, recipe.sh_degree))
+        return Start(state, f"{n_rows(state.gaussians):,} {recipe.representation.name} of {path}", [])
     start, notices = load_start(path, scene)
     return Start(initial_state(start, recipe, seed), f"{len(start.points):,} points of {path}", notices)
 

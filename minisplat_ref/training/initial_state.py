@@ -1,5 +1,8 @@
 """The state before the first iteration, and whether a given state belongs to a scene."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from minisplat_ref.errors import InputError
@@ -12,8 +15,19 @@ from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
 
 
-def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
+def initial_state(
+    scene: Scene, recipe: Recipe, seed: int, populate: Callable[[np.random.Generator], Any] | None = None
+) -> TrainState:
     """Return the state before the first iteration.
+
+    Parameters
+    ----------
+    scene : Scene
+    recipe : Recipe
+    seed : int
+        Of all random draws.
+    populate : callable, optional
+        ``populate(rng)`` makes the population; by default the representation does, of the scene's points.
 
     Raises
     ------
@@ -30,9 +44,13 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
-    if recipe.starts_densely:
-        scene = _with_dense_points(scene, settings_of(recipe).get("budget"))
-    gaussians = contiguous(representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng))
+    if populate is None:
+        if recipe.starts_densely:
+            scene = _with_dense_points(scene, settings_of(recipe).get("budget"))
+        gaussians = representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng)
+    else:
+        gaussians = populate(rng)
+    gaussians = contiguous(gaussians)
     shared = dict(representation.shared(scene, rng))
     for calibration in recipe.active_calibrations:
         shared |= calibration.initial(n_views)

@@ -4,6 +4,7 @@ The first is :data:`GAUSSIANS`, that of 3DGS. An extension's has further fields 
 """
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +48,9 @@ class Representation(NamedTuple):
     """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
     extends: frozenset[str] = frozenset()
     """Names of further representations whose populations ``extend`` takes: a training can start from their models."""
+    from_file: Callable[[Path, Scene, int, np.random.Generator], Any] | None = None
+    """``from_file(path, scene, sh_degree, rng)``: the population of a file that ``--init`` names, where such a file is
+    more than points. A training by its recipes needs one, or a run."""
 
 
 GAUSSIANS = Representation("gaussians")

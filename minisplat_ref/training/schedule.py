@@ -270,16 +270,16 @@ def as_trained(recipe: Recipe, model: Model) -> Recipe:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return the settings that :func:`configure` can replace, each with its present value, the first of several.
 
-    Settings of events, of loss terms, and of the representation's ``extend``, ``shared`` and renderer go by their own
-    names;
-    the weight of a loss term by the term's name; whether a calibration is on by the calibration's name; and
-    ``starts_densely``.
+    Settings of events, of loss terms, and of the representation's ``extend``, ``shared``, ``from_file`` and renderer go
+    by their own names; the weight of a loss term by the term's name; whether a calibration is on by the calibration's
+    name; and ``starts_densely``.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
     of = recipe.representation
-    representation = [_settings(function) for function in (of.extend, of.shared, of.renderer.render)]
+    functions = (of.extend, of.shared, of.renderer.render, of.from_file)
+    representation = [_settings(function) for function in functions if function is not None]
     start = [{START: recipe.starts_densely}]
     found = [*events, *terms, *switches, *representation, *start]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
@@ -321,6 +321,7 @@ def _with_setting(representation: Representation, name: str, value: Any) -> Repr
     return representation._replace(
         extend=_with(representation.extend, name, value),
         shared=_with(representation.shared, name, value),
+        from_file=representation.from_file and _with(representation.from_file, name, value),
         renderer=renderer._replace(render=_with(renderer.render, name, value)),
     )
 
@@ -431,7 +432,9 @@ def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe as numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
     fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
-    drawn = _named_settings(recipe.representation.renderer.render)
+    representation = recipe.representation
+    drawn = _named_settings(representation.renderer.render)
+    role = "extend" if representation.from_file is None else "from_file"
     return {
         **fields,
         **cooling,
@@ -442,8 +445,8 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         "events": [_describe_event(event) for event in recipe.events],
         "calibrations": [calibration.name for calibration in recipe.active_calibrations],
         "representation": {
-            "name": recipe.representation.name,
-            **_describe_function(recipe.representation.extend, "extend"),
+            "name": representation.name,
+            **_describe_function(getattr(representation, role), role),
             **({"renderer": drawn} if drawn else {}),
         },
     }

@@ -39,6 +39,8 @@ def steps(first, last, period=1, *, but=()):
 
 # --- the tables ---
 
+DENSITY_CONTROL = ("collect_gradients", "clone_and_split", "prune_", "reset_opacity")  # of 3DGS, by how names begin
+
 GS = {
     **rows("3DGS, section 5.1", photometric=(1.0, 1), photometric__dssim_weight=0.2),
     **rows(
@@ -346,6 +348,16 @@ TABLES = {
     ),
     "fans": FANS,
     "gaustudio": GAUSTUDIO,
+    "games": {
+        **{name: row for name, row in GS_ACCEL.items() if not name.startswith(DENSITY_CONTROL)},
+        **rows(
+            f"{OURS}: what is trained on a face, how fast, and no density control",
+            refresh_places=[steps(1, 30_000)],
+            rate__corner_logits=1e-2,
+            rate__log_sizes=5e-3,
+            **{f"rate__{name}": 0.0 for name in ("means", "quats", "log_scales", "p0", "p1", "p2")},
+        ),
+    },
     "gdgs": GDGS,
     "micro": MICRO,
     "mvg": MVG,
@@ -534,6 +546,7 @@ TABLES["lucas-kanade"] = GS_ACCEL | rows(
 )
 
 CONSTANTS = [
+    ("games.faces", "THINNESS", 1e-3, f"{OURS}: the paper has a constant near zero, of no unit"),
     ("antialiasing.method", "EPS2D", 0.1, "Mip-Splatting, released code"),
     ("analytic.reference", "LINEAR", 1.6, "Analytic-Splatting, its logistic curve"),
     ("analytic.reference", "CUBIC", 0.07, "Analytic-Splatting, its logistic curve"),

@@ -12,9 +12,9 @@ There are three ways to change a trained scene without training it again.
 - *Physics* (:mod:`.mass_spring`, :mod:`.springs`): the mesh moves as masses and springs under gravity, integrated by
   velocity Verlet with an account of the energy, and the scene bound to it follows.
 
-:mod:`.binding` says where this deviates from GaMeS: nothing is trained on the faces, and the whole of F acts on a
-Gaussian. Left out are training with a mesh, collisions of a sheet with itself, solids, and relighting of what was
-rotated. ``docs/FAMILY.md`` has the measured figures.
+:mod:`.binding` says where this deviates from GaMeS: any Gaussians are bound, and the whole of F acts on them. The
+extension ``games`` trains them on the faces. Left out are collisions of a sheet with itself, solids, and relighting of
+what was rotated. ``docs/FAMILY.md`` has the measured figures.
 
     minisplat-ref proxies edit runs/fox out.ply --sphere 0 0 2 0.5 --rotate 0 30 0
     minisplat-ref proxies cage runs/banana sheet.ply --cells 20

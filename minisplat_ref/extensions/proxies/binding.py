@@ -26,9 +26,9 @@ surface the map of the nearest triangle is extrapolated, which magnifies its rot
 that are farther away. Inside a hull around a solid object, Gaussians on either side of the middle belong to opposite
 faces, and are torn apart when these rotate differently; a sheet, or a mesh close to the surface, serves better.
 
-This deviates from GaMeS in two ways. Gaussians are not trained on the faces but bound as they are, so they may lie off
-the surface and have any shape. And in GaMeS the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of
-the triangle, which ignores shear.
+This deviates from GaMeS in two ways. Gaussians are bound as they are, so they may lie off the surface and have any
+shape; the extension ``games`` trains them on the faces. And in GaMeS the scales of a flat Gaussian are two lengths of a
+Gram-Schmidt frame of the triangle, which ignores shear.
 """
 
 from collections.abc import Callable, Iterable
