@@ -10,8 +10,17 @@ import numpy as np
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, gather, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import ZERO
+from minisplat_ref.types import Floats
 
 DOUBLE = np.float64(0)  # names the dtype
+
+
+def contiguous(*tables: Floats) -> tuple[Floats, ...]:
+    """Return tables [N, ...] as the kernels are compiled for, C-contiguous; those that are so are not copied.
+
+    For another layout Numba would compile them once more, some ten seconds for a view and its gradient.
+    """
+    return tuple(np.ascontiguousarray(table) for table in tables)
 
 
 @scalar

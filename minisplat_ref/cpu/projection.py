@@ -17,6 +17,7 @@ from minisplat_ref.constants import COMPENSATION_FLOOR, JACOBIAN_CLAMP, Conventi
 from minisplat_ref.cpu.gaussian_rows import (
     DOUBLE,
     add,
+    contiguous,
     gather_wide,
     list_visible,
     load_rows,
@@ -147,7 +148,7 @@ def project(
         np.empty((n, 2), np.int32),
         np.empty((n, 4), np.int32),
     )
-    primitives = Primitives(means, quats, scales, opacities)
+    primitives = Primitives(*contiguous(means, quats, scales, opacities))
     alpha_min = dtype.type(conventions.alpha_min)
     extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
     _project(primitives, pose_of(camera), constants_of(camera, conventions), extent, out)
@@ -254,7 +255,7 @@ def project_vjp(
         np.empty(3, dtype),
     )
     primitives, pose, constants = (
-        Primitives(means, quats, scales, opacities),
+        Primitives(*contiguous(means, quats, scales, opacities)),
         pose_of(camera),
         constants_of(camera, conventions),
     )

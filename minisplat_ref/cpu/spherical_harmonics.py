@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible_of, load_rows, total_of, triple
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, contiguous, list_visible_of, load_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -282,6 +282,7 @@ def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
     """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
     colors = np.empty(sh_dc.shape, sh_dc.dtype)
+    means, sh_dc = contiguous(means, sh_dc)
     shaded = Shaded(means, sh_dc, sh_rest.ravel(), 3 * sh_rest.shape[1])
     _sh_colors(shaded, _harmonics(camera, degree, means), radii, colors)
     return colors
@@ -319,6 +320,7 @@ def sh_colors_vjp(
         np.empty(3, dtype),
     )
     width = 3 * sh_rest.shape[1]
+    means, sh_dc = contiguous(means, sh_dc)
     shaded = Shaded(means, sh_dc, sh_rest.ravel(), width)
     v_shaded = Shaded(out.means, out.sh_dc, out.sh_rest.reshape(-1), width)
     v_offset = _sh_colors_vjp(shaded, _harmonics(camera, degree, means), radii, v_colors, v_shaded)
