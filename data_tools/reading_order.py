@@ -171,6 +171,7 @@ ORDER = (
                 (),
                 "small networks trained with a scene: opacities that depend on the view",
             ),
+            Step(("extensions/segment/",), (), "labels of Gaussians from masks of photographs, by a vote"),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),
     ),

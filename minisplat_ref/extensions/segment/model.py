@@ -1,0 +1,94 @@
+"""The model that the commands work on: primitives, who draws them, cameras, and files with labels."""
+
+from collections import namedtuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import CORE, load_extension
+from minisplat_ref.io import viewpoints
+from minisplat_ref.io.frames import frame_of_means, place_camera, place_population
+from minisplat_ref.io.label import Label
+from minisplat_ref.io.ply import further_properties, read_label, save_ply
+from minisplat_ref.io.ply_file import read_vertices
+from minisplat_ref.io.viewpoints import Viewpoint
+from minisplat_ref.rendering import Renderer
+from minisplat_ref.training.representation import nothing_shared
+from minisplat_ref.training.schedule import configure_renderer
+from minisplat_ref.types import Bools, Ints
+
+COLUMN = "label"
+
+
+class Subject(NamedTuple):
+    """A model with its cameras."""
+
+    file: Path
+    """Its PLY."""
+    label: Label
+    """What the file says about how it is drawn."""
+    population: Any
+    """As the file holds it."""
+    placed: Any
+    """The same in a world that float32 can hold."""
+    renderer: Renderer
+    cameras: list[Viewpoint]
+    """In the world of ``placed``."""
+
+
+def read_subject(path: Path, cameras: Path | None = None) -> Subject:
+    """Read a run's folder, or a PLY with the ``cameras.json`` beside it.
+
+    Raises
+    ------
+    InputError
+        There is no model or there are no cameras, or the renderer needs what no PLY holds.
+    """
+    file = path / "point_cloud.ply" if path.is_dir() else path
+    label = read_label(file)
+    owner = CORE if label.extension is None else load_extension(label.extension)
+    representation = owner.representation
+    if representation.shared is not nothing_shared:
+        raise InputError(
+            f"{file} is drawn by {owner.name}, with parameters that no PLY holds: segment a run of another recipe"
+        )
+    population = owner.load(file, representation.population)
+    listed = file.parent / "cameras.json" if cameras is None else cameras
+    if not listed.is_file():
+        raise InputError(f"{listed} is not there: give the folder of a run, or --cameras JSON")
+    frame = frame_of_means(population.means)
+    return Subject(
+        file,
+        label,
+        population,
+        place_population(population, representation.units, frame),
+        configure_renderer(representation.renderer, label.set),
+        [view._replace(camera=place_camera(view.camera, frame)) for view in viewpoints.read(listed)],
+    )
+
+
+def save_labelled(path: Path, subject: Subject, labels: Ints) -> None:
+    """Write the whole model with the property ``label``, which other programs skip."""
+    fields = subject.population._asdict() | {COLUMN: labels.astype(np.float32)}
+    save_ply(path, namedtuple("Labelled", fields)(**fields), subject.label)
+
+
+def save_part(path: Path, subject: Subject, is_kept: Bools) -> None:
+    """Write those primitives that are kept, as the model's file has them."""
+    population = subject.population
+    save_ply(path, population._make(field[is_kept] for field in population), subject.label)
+
+
+def read_labels(subject: Subject) -> Ints:
+    """Return the labels [N] that :func:`save_labelled` wrote.
+
+    Raises
+    ------
+    InputError
+        The file has none.
+    """
+    if COLUMN not in further_properties(subject.file):
+        raise InputError(f"{subject.file} has no labels: write them with minisplat-ref segment label")
+    return read_vertices(subject.file)[COLUMN].astype(np.int64)
