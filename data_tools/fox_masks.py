@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
-SIZE = (270, 480)  # of the masks, pixels; twice that of photographs divided by eight
+SIZE = (270, 480)  # of the masks, pixels; of photographs of the scene, which a training at --downscale 2 halves
 HEAD = {
     "0002": "170 38 190 70 195 100 225 95 243 85 228 115 230 160 255 185 250 205 225 215 195 210 180 245 160 290 "
     "110 300 78 290 75 225 85 180 105 140 125 115 133 75",
