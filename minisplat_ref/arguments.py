@@ -164,6 +164,17 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
     )
 
 
+def add_worker_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--workers`` and ``--cluster``, of which at most one may be given."""
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(
+        "--workers", type=integer(0), default=0, metavar="N", help="train in N processes at once (default 0: in turn)"
+    )
+    group.add_argument(
+        "--cluster", type=name, default=None, metavar="ADDRESS", help="train by a Dask scheduler's: tcp://HOST:PORT"
+    )
+
+
 def decibels(text: str) -> float:
     """Read a number of dB of at least 0, as an option of the command line."""
     try:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.arguments import Commands, HelpFormatter, integer, list_of, name, option_name
+from minisplat_ref.arguments import Commands, HelpFormatter, add_worker_arguments, integer, list_of, name, option_name
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ DEFAULTS: dict[str, Any] = {
 }
 
 DESCRIPTION = """\
-Train a scene by several recipes, one training after the other, and set the
-results side by side. DIR will hold a run folder RECIPE-seedS for each training,
+Train a scene by several recipes, in turn or by workers, and set the results
+side by side. DIR will hold a run folder RECIPE-seedS for each training,
 compare.json, the figures as PNG, and report.html with all of it.
 
 The first recipe is what the others are compared with. After Ctrl-C or a crash
@@ -37,7 +37,7 @@ EPILOG = """\
 examples:
   minisplat-ref compare photos/fox --recipes 3dgs-accel,mini-splatting2 \\
       --iterations 3000,1800 --seeds 0,1,2 --out runs/fox-compared
-  minisplat-ref compare --resume runs/fox-compared"""
+  minisplat-ref compare --resume runs/fox-compared --workers 2"""
 
 INTERRUPTED = 130  # exit code, of a training too
 
@@ -88,17 +88,19 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--init", type=Path, metavar="START", help="as for train: points or run to start from")
     parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
+    add_worker_arguments(parser)
     parser.set_defaults(run=run, needs=("matplotlib",))
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, measure, write the files, print the table."""
     from minisplat_ref.comparison.plan import check, remove_if_unused, save_plan
-    from minisplat_ref.comparison.runs import statuses, train_all, warm_up
+    from minisplat_ref.comparison.runs import statuses, train_all, train_by_workers, warm_up
     from minisplat_ref.runs import run_folder
+    from minisplat_ref.runs.cluster import Workers
     from minisplat_ref.training.interruption import terminated_like_interrupted
 
-    given = vars(args)
+    given, workers = vars(args), Workers(args.workers, args.cluster)
     plan = _resume(given) if "resume" in given else _new(given)
     scene = check(plan)
     stages = statuses(plan)
@@ -108,11 +110,14 @@ def run(args: argparse.Namespace) -> int:
     save_plan(plan)
     try:
         with terminated_like_interrupted():
-            code = train_all(plan, stages)
+            code = train_by_workers(plan, stages, workers) if workers.is_used else train_all(plan, stages)
             if code == 0:
                 _report(plan, scene)
     except KeyboardInterrupt:
         code = INTERRUPTED
+    except InputError:
+        remove_if_unused(plan.folder)
+        raise
     if code == INTERRUPTED:
         print(f"minisplat-ref: interrupted; to continue: minisplat-ref compare --resume {plan.folder}", file=sys.stderr)
     elif code != 0:

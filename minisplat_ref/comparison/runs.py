@@ -1,4 +1,4 @@
-"""The trainings of a comparison: one after the other, each in a separate process, whose peak memory is its own.
+"""The trainings of a comparison: each in a separate process, whose peak memory is its own; in turn, or by workers.
 
 A comparison that was cut off continues where it was: finished runs stay, one with a checkpoint continues from it.
 """
@@ -10,17 +10,20 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
 
 from minisplat_ref.arguments import option_name
-from minisplat_ref.comparison.plan import Plan, Run
+from minisplat_ref.comparison.plan import Plan, Run, load_plan
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.runs import run_folder
+from minisplat_ref.runs.cluster import Workers, carry_out_all
 from minisplat_ref.runs.settings import Settings
 from minisplat_ref.runs.settings import load as load_settings
+from minisplat_ref.runs.worker import Job
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 
@@ -28,7 +31,7 @@ WARM_UP = 20  # iterations, to which each recipe is scaled, so that all its even
 WARM_UP_VIEWS = 4
 SAVING_SECONDS = 5.0  # after Ctrl-C; a training that continues for longer has not been told
 
-TRAIN = (sys.executable, "-m", "minisplat_ref", "train")
+PROGRAM = (sys.executable, "-m", "minisplat_ref")
 
 Status = Literal["finished", "cut off", "lost", "new"]
 """How far a training has come: to its end, to a checkpoint, not as far, or not begun."""
@@ -102,17 +105,76 @@ def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
     CalledProcessError
         A training has been killed or has a programming error.
     """
-    for number, (run, status) in enumerate(zip(plan.runs, statuses, strict=True), start=1):
-        heading = f"run {number} of {len(statuses)}: {run.recipe}, seed {run.seed}, {run.iterations} iterations"
-        print(heading + HEADINGS[status], flush=True)  # before the lines of the other process
-        if status == "finished":
-            continue
-        if status == "lost":
-            shutil.rmtree(run.folder)
-        code = _train(_resume_command(run) if status == "cut off" else _command(plan, run))
+    for number, status in enumerate(statuses):
+        print(_name(plan, number) + HEADINGS[status], flush=True)  # before the lines of the other process
+        words = next_words(plan, number)
+        code = 0 if words is None else _train([*PROGRAM, *words])
         if code != 0:
             return code
     return 0
+
+
+def train_by_workers(plan: Plan, statuses: Sequence[Status], workers: Workers) -> int:
+    """Train like :func:`train_all`, several at once; when a training fails, the others are still carried out.
+
+    Parameters
+    ----------
+    plan : Plan
+        As ``plan.json`` of its folder has it, which the workers read.
+    statuses : sequence of Status
+    workers : Workers
+
+    Raises
+    ------
+    InputError
+        The workers cannot be used; see :func:`minisplat_ref.runs.cluster.carry_out_all`.
+    """
+    folder = plan.folder.resolve()
+    jobs = []
+    for number, status in enumerate(statuses):
+        print(_name(plan, number) + HEADINGS[status], flush=True)
+        if status != "finished":
+            run_of = folder / plan.runs[number].folder.name
+            jobs.append(Job(_name(plan, number), stored_words, (folder, number), run_of))
+    inputs = [plan.scene, *map(Path, plan.files.values())]
+    return carry_out_all(workers, jobs, folder, inputs, lambda job: print(f"{job.name}: ended", flush=True))
+
+
+def stored_words(folder: Path, number: int) -> list[str] | None:
+    """Return :func:`next_words` of the comparison in a folder."""
+    return next_words(load_plan(folder), number)
+
+
+def next_words(plan: Plan, number: int) -> list[str] | None:
+    """Return the command that takes a training from where it is to its end, as words; None if it has ended.
+
+    What is left of a training without a checkpoint is removed.
+
+    Parameters
+    ----------
+    plan : Plan
+    number : int
+        Index of the training in ``plan.runs``.
+    """
+    run = plan.runs[number]
+    status = _status(plan, run)
+    if status == "finished":
+        return None
+    if status == "cut off":
+        return ["train", "--resume", str(run.folder)]
+    if status == "lost":
+        shutil.rmtree(run.folder)
+    options = {**_options(plan, run), "out": run.folder}
+    return [
+        "train",
+        str(plan.scene),
+        *(part for name, value in options.items() for part in (option_name(name), str(value))),
+    ]
+
+
+def _name(plan: Plan, number: int) -> str:
+    run = plan.runs[number]
+    return f"run {number + 1} of {len(plan.runs)}: {run.recipe}, seed {run.seed}, {run.iterations} iterations"
 
 
 def settings_of(plan: Plan, run: Run) -> Settings:
@@ -139,16 +201,6 @@ def _options(plan: Plan, run: Run) -> dict[str, Any]:
         **plan.files,
         **run.options,
     }
-
-
-def _command(plan: Plan, run: Run) -> list[str]:
-    options = {**_options(plan, run), "out": run.folder}
-    texts = [part for name, value in options.items() for part in (option_name(name), str(value))]
-    return [*TRAIN, str(plan.scene), *texts]
-
-
-def _resume_command(run: Run) -> list[str]:
-    return [*TRAIN, "--resume", str(run.folder)]
 
 
 class _Terminated(KeyboardInterrupt):
