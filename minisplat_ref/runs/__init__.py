@@ -6,6 +6,10 @@ Train: what ``train`` does
     :mod:`.run` (the training), :mod:`.first_use` (compiles the kernels ahead), :mod:`.checkpoints` (the last two, and
     the newest model), :mod:`.fingerprint` (which scene the run belongs to).
 
+Several runs at once
+    :mod:`.cluster` (connect to workers, check them, hand out), :mod:`.worker` (what a worker does with a job),
+    :mod:`.attached` (its command, which ends with it).
+
 What a run records
     :mod:`.progress` (bar and ``log.jsonl``), :mod:`.events` (what fired, ``events.jsonl``), :mod:`.curve`
     (``curve.jsonl``), :mod:`.preview` (an image of the training), :mod:`.scoring` (``metrics.json`` and ``renders/``).
