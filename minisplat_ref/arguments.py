@@ -171,7 +171,11 @@ def add_worker_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=integer(0), default=0, metavar="N", help="train in N processes at once (default 0: in turn)"
     )
     group.add_argument(
-        "--cluster", type=name, default=None, metavar="ADDRESS", help="train by a Dask scheduler's: tcp://HOST:PORT"
+        "--cluster",
+        type=name,
+        default=None,
+        metavar="ADDRESS",
+        help="train by the workers of a Dask scheduler, tcp://HOST:PORT",
     )
 
 

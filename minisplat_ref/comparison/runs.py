@@ -164,12 +164,13 @@ def next_words(plan: Plan, number: int) -> list[str] | None:
         return ["train", "--resume", str(run.folder)]
     if status == "lost":
         shutil.rmtree(run.folder)
+    return _first_words(plan, run)
+
+
+def _first_words(plan: Plan, run: Run) -> list[str]:
     options = {**_options(plan, run), "out": run.folder}
-    return [
-        "train",
-        str(plan.scene),
-        *(part for name, value in options.items() for part in (option_name(name), str(value))),
-    ]
+    texts = [part for name, value in options.items() for part in (option_name(name), str(value))]
+    return ["train", str(plan.scene), *texts]
 
 
 def _name(plan: Plan, number: int) -> str:

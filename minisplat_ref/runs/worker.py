@@ -8,6 +8,7 @@ is told to save and to end, as by Ctrl-C.
 
 import hashlib
 import os
+import platform
 import subprocess
 import sys
 import tempfile
@@ -96,7 +97,7 @@ def carry_out(job: Job, site: Site) -> Outcome:
     if not site.token.exists() and site.token.parent.exists():
         return Outcome(INTERRUPTED)
     if (path := unseen(site)) is not None:
-        raise InputError(unseen_line(os.uname().nodename, path))
+        raise InputError(unseen_line(platform.node(), path))
     if job.folder is not None:
         wait_until_free(job.folder)
     words = job.choose(*job.arguments)

@@ -168,7 +168,8 @@ def test_the_report_in_a_browser(compared, browser):
 
 def compare_with(command, monkeypatch, scene_folder, out):
     monkeypatch.setattr(runs_module, "warm_up", lambda plan, scene: None)
-    monkeypatch.setattr(runs_module, "_command", lambda plan, run: command)
+    monkeypatch.setattr(runs_module, "PROGRAM", ())
+    monkeypatch.setattr(runs_module, "_first_words", lambda plan, run: command)
     return main(["compare", str(scene_folder), *OPTIONS, "--out", str(out)])
 
 
@@ -258,9 +259,9 @@ def test_options_go_to_the_recipes_that_take_them(monkeypatch):
     monkeypatch.setitem(RECIPES, "b", RECIPES["3dgs"]._replace(events=(event,)))
     ours = plan(budget=70, scene_type="outdoor", seeds=(0,))
     assert [run.options for run in ours.runs] == [{}, {"budget": 70, "scene_type": "outdoor"}]
-    command = runs_module._command(ours, ours.runs[1])
+    words = runs_module.next_words(ours, 1)
     expected = "--recipe b --iterations 100 --seed 0 --downscale 2 --test-every 4 --eval-every 4 --budget 70"
-    assert " ".join(command[3:]) == f"train scene {expected} --scene-type outdoor --out out/b-seed0"
+    assert " ".join(words) == f"train scene {expected} --scene-type outdoor --out out/b-seed0"
 
 
 @pytest.mark.parametrize(("iterations", "n_points"), [(3000, 24), (1000, 24), (60, 30), (5, 5), (1, 1)])
