@@ -123,14 +123,7 @@ ORDER = (
                 "scale, compactness, storage, editing",
             ),
             Step(
-                (
-                    "mechanisms/tangent/",
-                    "extensions/pixel_order/",
-                    "mechanisms/cameras/",
-                    "extensions/lens/",
-                    "mechanisms/rays/",
-                    "extensions/rays/",
-                ),
+                ("mechanisms/tangent/", "extensions/pixel_order/", "mechanisms/rays/", "extensions/rays/"),
                 (18,),
                 "depth order per pixel; rays, shadows and mirrors",
             ),
@@ -172,7 +165,11 @@ ORDER = (
                 "small networks trained with a scene: opacities that depend on the view",
             ),
             Step(("extensions/segment/",), (), "labels of Gaussians from masks of photographs, by a vote"),
-            Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
+            Step(
+                ("mechanisms/cameras/", "extensions/lens/", "extensions/wave/"),
+                (23,),
+                "lenses that are not pinholes, along exact rays; a hologram of a scene",
+            ),
         ),
     ),
     Part(
