@@ -156,12 +156,12 @@ ORDER = (
             ),
             Step(
                 ("mechanisms/motion/", "extensions/lucas_kanade/"),
-                (),
+                (24,),
                 "a warp that moves a scene, three forms of its velocity, and flow from photographs",
             ),
             Step(
                 ("mechanisms/networks/", "extensions/vdgs/"),
-                (),
+                (24,),
                 "small networks trained with a scene: opacities that depend on the view",
             ),
             Step(("extensions/segment/",), (), "labels of Gaussians from masks of photographs, by a vote"),
