@@ -170,6 +170,7 @@ ORDER = (
                 (),
                 "small networks trained with a scene: opacities that depend on the view",
             ),
+            Step(("extensions/satellite/",), (), "affine cameras of satellites, the sun's shadows, surface models"),
             Step(("extensions/wave/",), (), "flat Gaussians as waves of light: a hologram of a scene"),
         ),
     ),
