@@ -253,6 +253,26 @@ def test_gradients(name):
         assert np.abs(found - expected).max() < FINE
 
 
+def test_slopes_at_the_kinks():
+    """On a kink the gradient is the slope of one side: lit where h = h_s, the right cell on a border between cells."""
+    of_sun, d = np.array([[1.0, 3.0, 2.0]]), 1e-6
+
+    def shadow(h):  # of a pixel over the sun's middle one
+        return reference.shadows(np.full((1, 1), h), of_sun, (0.0, 0.0), (1, 0))
+
+    at = shadow(3.0)
+    right, left = (shadow(3.0 + d).shadows - at.shadows) / d, (at.shadows - shadow(3.0 - d).shadows) / d
+    assert right[0, 0] == 0 and left[0, 0] == pytest.approx(reference.DARKENING, rel=1e-5)
+    assert [float(v.sum()) for v in reference.shadows_vjp(at, np.ones((1, 1)))] == [0, 0]
+    image, x, y = of_sun[..., None], np.full((1, 1), 1.5), np.full((1, 1), 0.5)
+    read = reference.sample(image, x, y)
+    sides = [(reference.sample(image, x + sign * d, y).values - read.values)[0, 0, 0] / (sign * d) for sign in (1, -1)]
+    assert sides == pytest.approx([-1.0, 2.0])
+    assert reference.sample_vjp(read, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == pytest.approx(-1.0)
+    edge = reference.sample(image, x + 1, y)  # the last centre: constant beyond it
+    assert reference.sample_vjp(edge, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == 0
+
+
 # --- the renderer ---
 
 
@@ -280,6 +300,23 @@ def test_without_sun_and_radiometry_it_is_plain_splatting(setting, backend):
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh_dc"):
         expected = getattr(theirs.gaussians, name)
         assert np.abs(getattr(ours.gaussians, name) - expected).max() <= 1e-13 * np.abs(expected).max()
+
+
+def test_a_lone_gaussian_does_not_shade_itself(setting):
+    """A tie, not a kink: h and h_s are equal but for rounding, s is 1, and what both get from it cancels."""
+    g = type(setting.gaussians)(*(field[:1] for field in setting.gaussians))
+    g = g._replace(means=np.array([[0.0, 0.0, 0.3]]), opacity_logits=np.array([4.0]))
+    camera = boxes.zenith(24)._replace(optics=Optics("affine", (0.31, -0.17)))
+    camera = camera._replace(cam_from_world_R=camera.cam_from_world_R * [[1.0], [1.0], [1 / boxes.SCALE]])
+    request = Request(backend=REFERENCE, wants=frozenset({"shadow"}))
+    output, tape = SATELLITE.render(Model(g), view_from(camera), request)
+    shadow = output.image[..., 3]
+    is_seen = output.alpha > 0.2  # both altitudes are those of the Gaussian
+    assert is_seen.sum() > 20 and np.abs(shadow[is_seen] - 1).max() < EXACT
+    v = np.zeros_like(output.image)
+    v[..., 3] = is_seen
+    found = SATELLITE.render_vjp(tape, v).gaussians
+    assert max(np.abs(field).max() for field in found if field.size) < EXACT * is_seen.sum()
 
 
 def test_a_roof_hides_the_sun():

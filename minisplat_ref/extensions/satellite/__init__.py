@@ -23,9 +23,10 @@ renders.
 ``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper as follows. Altitudes are divided by alpha; where almost nothing is, alpha counts as 0.05.
-The exponent 0.4 and the limit 0.3 are per metre. The rates of the radiometry and the opacity of what is pruned are
-ours. Left out are the registration of a surface model to a reference, panchromatic images and sensors whose RPC has
-to be corrected (bundle adjustment); image positions have to be right already.
+The exponent 0.4 and the limit 0.3 are per metre. Rates, the nearly transparent start, the random background and the
+opacity of what is pruned are ours: an opaque start in the volume stays a fog, and on black a translucent surface of
+bright colours looks like an opaque one. Left out are the registration of a surface model to a reference, panchromatic
+images and sensors whose RPC has to be corrected (bundle adjustment); image positions have to be right already.
 """
 
 from minisplat_ref.extensions.extension import Extension

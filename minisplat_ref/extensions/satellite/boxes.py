@@ -10,7 +10,7 @@ import numpy as np
 from minisplat_ref.extensions.satellite.affine_fit import camera_of
 from minisplat_ref.types import Bools, Camera, Floats, Frame, Scene, View
 
-SCALE, SIZE, N_VIEWS = 48.0, 64, 6  # metres per unit, pixels, photographs
+SCALE, SIZE, N_VIEWS = 48.0, 96, 6  # metres per unit, pixels, photographs
 LOW, HIGH = 0.0, 24.0  # metres
 SKY = np.array([0.30, 0.35, 0.45])  # what lights the shadows
 
@@ -60,7 +60,7 @@ def make_boxes(rng: np.random.Generator) -> Boxes:
     heights = rng.uniform(6, 20, size=12)
     low = np.column_stack([centres - half, np.zeros(12)])
     high = np.column_stack([centres + half, heights])
-    colors = rng.uniform(0.25, 0.75, size=(13, 2, 3))
+    colors = rng.uniform(0.15, 0.6, size=(13, 2, 3))
     colors[-1] = 0.5, 0.5, 0.42
     return Boxes(low, high, colors)
 
@@ -92,7 +92,7 @@ def trace(boxes: Boxes, camera: Camera, sun: Floats | None) -> tuple[Floats, Flo
     lengths, box, axis = meet(boxes, origins, down, top)
     points = origins + lengths[:, None] * down
     albedo = boxes.colors[box, np.where((axis == 2) | (box < 0), 0, 1)]
-    albedo = albedo * np.where(box < 0, 0.85 + 0.15 * np.sin(points[:, 0]) * np.sin(0.8 * points[:, 1]), 1)[:, None]
+    albedo = albedo * texture(points)[:, None]
     shape = camera.height, camera.width
     is_shadow = np.zeros(len(points), bool)
     if sun is not None:
@@ -100,14 +100,21 @@ def trace(boxes: Boxes, camera: Camera, sun: Floats | None) -> tuple[Floats, Flo
     return albedo.reshape(*shape, 3), points[:, 2].reshape(shape), is_shadow.reshape(shape)
 
 
-def make_scene(seed: int, n_points: int = 3000, size: int = SIZE) -> Truth:
+def texture(points: Floats) -> Floats:
+    """Return the factor of the colour [P] at points [P, 3] in metres: waves of 4 to 40 m, between 0.68 and 1.32."""
+    waves = np.array([[1.1, 0.7, 0.9], [-0.5, 0.9, 0.6], [0.35, 0.4, -0.5], [-0.12, 0.1, 0.2]])
+    found: Floats = 1 + 0.08 * np.sin(points @ waves.T + np.arange(4)).sum(axis=1)
+    return found
+
+
+def make_scene(seed: int, n_points: int = 5000, size: int = SIZE) -> Truth:
     """Return the scene of a seed, with random points in its volume; the first photograph has identity radiometry."""
     rng = np.random.default_rng(seed)
     boxes, views, masks, radiometry = make_boxes(rng), [], [], []
     turned = rng.uniform(0, 2 * np.pi)
     for k in range(N_VIEWS):
         around, sunwards = turned + 2 * np.pi * k / N_VIEWS, turned + 1.9 * k
-        tilt = rng.uniform(0.15, 0.45) * np.array([np.cos(around), np.sin(around)])
+        tilt = rng.uniform(0.3, 0.6) * np.array([np.cos(around), np.sin(around)])
         sun = np.array([np.cos(sunwards), np.sin(sunwards), rng.uniform(1.0, 1.8)])
         camera = _camera(tilt, size, 2 * SCALE, sun)
         albedo, _, is_shadow = trace(boxes, camera, sun)

@@ -16,7 +16,7 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import show, with_deviation
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Floats, Model, Scene
 
@@ -27,6 +27,9 @@ ARMS = (
     "without sparsity",
     "without view consistency",
     "without entropy",
+    "an opaque start",
+    "means at the rate of 3DGS",
+    "a black background",
 )
 _TERMS = {ARMS[3]: "opacity_sparsity", ARMS[4]: "view_consistency", ARMS[5]: "shadow_entropy"}
 DISTANCES, OFF_NADIR = (500e3, 50e3, 5e3), (0.0, 25.0)  # metres, degrees
@@ -53,13 +56,20 @@ def arm_of(arm: str, recipe: Recipe, scene: Scene) -> tuple[Recipe, Scene]:
     if arm == "without radiometry":
         still = recipe.representation._replace(rates=Rates({RADIOMETRY: 0.0, IN_SHADOW: 0.01}, frozenset()))
         return recipe._replace(representation=still), scene
+    if arm == "an opaque start":
+        return recipe._replace(events=recipe.events[1:]), scene
+    if arm == "means at the rate of 3DGS":
+        slow = LogLinear(1.6e-4, 1.6e-6, recipe.iterations)
+        return recipe._replace(learning_rates=recipe.learning_rates.change(means=slow)), scene
+    if arm == "a black background":
+        return recipe._replace(has_random_background=False), scene
     losses = tuple(term for term in recipe.losses if term.name != _TERMS.get(arm))
     return recipe._replace(losses=losses), scene
 
 
 def measure(model: Model, truth: Truth) -> tuple[Measured, Floats]:
     """Return how far a model is from the truth, and its surface model [H, W]."""
-    heights = np.nan_to_num(surface_model(model, (SIZE, SIZE), SCALE))
+    heights = surface_model(model, (SIZE, SIZE), SCALE, min_alpha=0.0)
     off = heights - truth.heights
     found = []
     for view in truth.scene.train_views:

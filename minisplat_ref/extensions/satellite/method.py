@@ -8,7 +8,7 @@ import numpy as np
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.satellite.losses import ENTROPY, SPARSITY, view_consistency
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, REFERENCE_VIEW, SATELLITE
-from minisplat_ref.methods.gaussian_splatting import GS, prune_faint
+from minisplat_ref.methods.gaussian_splatting import GS, lower_opacities, prune_faint
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import Representation
@@ -17,6 +17,7 @@ from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Gaussians, Scene
 
 ITERATIONS = 5_000
+START_OPACITY, START_SIZE = 0.005, 0.5  # of what fills the volume; size relative to the distance of neighbours
 SKY_LIGHT = 0.05  # k at the start
 
 
@@ -29,6 +30,19 @@ def first_light(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
     """Return identity radiometry [V, 3, 4] and the light of the sky [V, 3] in each photograph's shadows."""
     n, dtype = len(scene.train_views), np.float32
     return {RADIOMETRY: np.tile(np.eye(3, 4, dtype=dtype), (n, 1, 1)), IN_SHADOW: np.full((n, 3), SKY_LIGHT, dtype)}
+
+
+def begin_transparent(state: TrainState, iteration: Iteration, *, opacity: float, size: float) -> None:
+    """Give all Gaussians one opacity, and multiply their sizes, so that light passes through the whole volume.
+
+    Points that fill a volume are a fog if they are as opaque as those on a surface (0.1): the photographs are explained
+    by the fog's upper half, and no gradient reaches the ground. Nearly transparent ones grow where views agree, and the
+    others are pruned.
+    """
+    g = state.gaussians
+    lower_opacities(state, np.full_like(g.opacity_logits, np.log(opacity / (1 - opacity))))
+    log_scales = g.log_scales + g.log_scales.dtype.type(np.log(size))
+    state.gaussians = state.gaussians._replace(log_scales=log_scales)
 
 
 def hold_sky(state: TrainState, iteration: Iteration) -> None:
@@ -68,18 +82,20 @@ SEEN_FROM_ABOVE = Representation(
     extend=without_directions,
     shared=first_light,
     renderer=SATELLITE,
-    rates=Rates({RADIOMETRY: 0.01, IN_SHADOW: 0.01}, frozenset()),
+    rates=Rates({RADIOMETRY: 0.001, IN_SHADOW: 0.01}, frozenset()),
     takes_optics=True,
 )
 
 RECIPE = GS._replace(
     name="satellite",
     iterations=ITERATIONS,
-    learning_rates=GS.learning_rates.change(means=LogLinear(1.6e-4, 1.6e-6, ITERATIONS)),
+    learning_rates=GS.learning_rates.change(means=LogLinear(6.4e-3, 6.4e-4, ITERATIONS), opacity_logits=0.1),
     sh_degree=0,
     sh_milestones=(),
+    has_random_background=True,
     losses=(*GS.losses, SPARSITY, CONSISTENCY, ENTROPY),
     events=(
+        At(1, partial(begin_transparent, opacity=START_OPACITY, size=START_SIZE)),
         During(hold_sky),
         Every(100, partial(prune_faint, min_opacity=0.005), start=500, min_gap=20),
         At(ITERATIONS, fold_reference),

@@ -10,12 +10,13 @@ m has 20 monomials, so a camera has 80 coefficients. They stand in a GeoTIFF's m
 """
 
 import re
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, one_line
 from minisplat_ref.types import Floats
 
 # Powers of (L, P, H) of the 20 monomials, in the order of RPC00B.
@@ -141,8 +142,14 @@ def read_rpc(path: str | Path) -> RPC:
             return parse_rpc(_read_text(beside), beside)
     if path.suffix.lower() not in (".tif", ".tiff"):
         raise InputError(f"{path}: no RPC; put {path.stem}_RPC.TXT beside it")
-    with import_rasterio(path).open(path) as file:
-        tags = file.tags(ns="RPC")
+    rasterio = import_rasterio(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # its RPC is its place
+            with rasterio.open(path) as file:
+                tags = file.tags(ns="RPC")
+    except rasterio.errors.RasterioIOError as error:
+        raise InputError(f"{path}: no GeoTIFF, {one_line(str(error))}") from error
     if not tags:
         raise InputError(f"{path}: its metadata have no RPC; put {path.stem}_RPC.TXT beside it")
     return _from_fields({name: _floats(str(text)) for name, text in tags.items()}, path)

@@ -1,8 +1,17 @@
-"""The stages of the gradient check: the renderer with an affine camera and the sun's shadows, all channels."""
+"""The stages of the gradient check: the renderer with an affine camera and the sun's shadows, all channels.
+
+Its kinks besides those of splatting: alpha at 0.05, where h passes h_s, the borders of the bilinear cells, the border
+of the sun's image, and colours at 0. A difference across one of them is refused.
+
+Ties are no kinks. A pixel that a lone Gaussian covers, in the photograph and in the sun's image, has ``h = h_s`` and
+equal neighbours wherever the Gaussian moves; rounding decides which is larger, and every step would be refused. What is
+less than :data:`TIE` apart counts as equal.
+"""
 
 import numpy as np
 
 from minisplat_ref.backends import Backend
+from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.satellite.affine_fit import AFFINE
 from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE
 from minisplat_ref.extensions.satellite.reference import MIN_ALPHA
@@ -15,6 +24,8 @@ from minisplat_ref.rendering import Request
 from minisplat_ref.types import Camera, Floats, Model, Optics, RenderOutput, View
 
 ALL = frozenset(CHANNELS)
+TIE = 1e-12
+"""Of a shadow or a slope, in float64: a thousand roundings of values near 1."""
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
@@ -36,8 +47,9 @@ def _stage(backend: Backend, setting: Setting, camera: Camera, name: str, rng: n
         output, tape = render(model, view, request._replace(wants=ALL))
         assert tape.of_sun is not None and tape.shadow is not None
         faint = [part.output.alpha > MIN_ALPHA for part in (tape.seen, tape.of_sun)]
-        inside = tape.shadow.sampled.slopes != 0
-        sides[:] = [*faint, tape.shadow.is_shaded, tape.shadow.sampled.corners, inside, model.gaussians.sh_dc > -1.77]
+        inside = np.abs(tape.shadow.sampled.slopes) > TIE
+        is_shaded, is_lit = tape.shadow.shadows < 1 - TIE, SH_C0 * model.gaussians.sh_dc + 0.5 > 0
+        sides[:] = [*faint, is_shaded, tape.shadow.sampled.corners, inside, is_lit]
         return output, tape
 
     renderer = SEEN_FROM_ABOVE.renderer._replace(render=watched, channels=lambda wants: channels(ALL))

@@ -27,7 +27,9 @@ A picture of it, NAME.png, is written beside.
 """
 
 
-def surface_model(model: Model, shape: tuple[int, int], scale: float, half: float = 1.0) -> Floats:
+def surface_model(
+    model: Model, shape: tuple[int, int], scale: float, *, half: float = 1.0, min_alpha: float = MIN_ALPHA
+) -> Floats:
     """Return altitudes [H, W] of the square of ``-half`` to ``half`` world units, NaN where alpha is below one half.
 
     Parameters
@@ -44,7 +46,7 @@ def surface_model(model: Model, shape: tuple[int, int], scale: float, half: floa
     A = np.diag([width / (2 * half), -height / (2 * half), scale])
     camera = camera_of(A, np.array([width / 2, height / 2, 0.0]), width, height)
     output, _ = SATELLITE.render(model, view_from(camera), Request(wants=frozenset({"altitude"})))
-    altitudes: Floats = np.where(output.alpha < MIN_ALPHA, np.nan, output.image[..., 3])
+    altitudes: Floats = np.where(output.alpha < min_alpha, np.nan, output.image[..., 3])
     return altitudes
 
 
