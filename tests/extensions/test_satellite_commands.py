@@ -58,7 +58,7 @@ def test_train_and_surface_model(trained, tmp_path):
     (run, printed), out = trained, tmp_path / "dsm.npy"
     assert "a.png: the affine camera is off by at most 0.0" in printed
     frame = json.loads((run / "satellite.json").read_text())
-    assert frame["zone"] == 33 and frame["origin"][2] == 40
+    assert frame["zone"] == 33 and frame["origin"][2] == 0
     assert main(["satellite", "dsm", str(run), "--out", str(out), "--gsd", "40"]) == 0
     heights = np.load(out)
     assert heights.shape == (round(2 * frame["scale"] / 40),) * 2

@@ -33,13 +33,13 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.satellite import surface_model, training
 from minisplat_ref.extensions.satellite.method import RECIPE, SEEN_FROM_ABOVE
 from minisplat_ref.extensions.satellite.stages import stages
-from minisplat_ref.studies.study import OUT, declare, iterations, seeds
+from minisplat_ref.studies.study import OUT, RESUMED_OUT, declare, iterations, seeds
 
 BOXES = declare(
     "boxes",
     "heights, shadows and colours of boxes without each part",
     f"{__name__}.claims.run_boxes",
-    *(OUT, seeds(3), iterations(1000)),
+    *(RESUMED_OUT, seeds(3), iterations(700)),
 )
 DISTANCE = declare("distance", "from where affine cameras fit perspective ones", f"{__name__}.claims.run_distance", OUT)
 EXTENSION = Extension(

@@ -107,6 +107,8 @@ def fit_affine(
 def frame_of(rpcs: list[RPC], size: tuple[int, int], altitudes: tuple[float, float]) -> Frame:
     """Return the frame of a scene: centred on what the middle of the first image sees, its half diagonal is 1.
 
+    The origin is at the lowest altitude, as which the renderer counts what is nearly transparent.
+
     Parameters
     ----------
     rpcs : list of RPC
@@ -122,7 +124,7 @@ def frame_of(rpcs: list[RPC], size: tuple[int, int], altitudes: tuple[float, flo
     zone, is_south = zone_of(ground[0, 0]), bool(ground[0, 1] < 0)
     places = utm_from_degrees(ground[:, 0], ground[:, 1], zone, is_south=is_south)
     scale = float(np.linalg.norm(places[2] - places[1]) / 2)
-    return Frame(np.array([*places[0], middle]), scale, zone, is_south)
+    return Frame(np.array([*places[0], altitudes[0]]), scale, zone, is_south)
 
 
 def fit_rpc(rpc: RPC, frame: Frame, size: tuple[int, int], altitudes: tuple[float, float], name: str) -> Fit:

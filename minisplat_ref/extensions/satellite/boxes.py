@@ -11,7 +11,7 @@ from minisplat_ref.extensions.satellite.affine_fit import camera_of
 from minisplat_ref.types import Bools, Camera, Floats, Frame, Scene, View
 
 SCALE, SIZE, N_VIEWS = 48.0, 96, 6  # metres per unit, pixels, photographs
-LOW, HIGH = 0.0, 24.0  # metres
+HIGH = 24.0  # metres above the ground to which points fill the volume
 SKY = np.array([0.30, 0.35, 0.45])  # what lights the shadows
 
 
@@ -107,8 +107,17 @@ def texture(points: Floats) -> Floats:
     return found
 
 
-def make_scene(seed: int, n_points: int = 5000, size: int = SIZE) -> Truth:
-    """Return the scene of a seed, with random points in its volume; the first photograph has identity radiometry."""
+def make_scene(seed: int, n_points: int = 5000, size: int = SIZE, below: float = 0.0) -> Truth:
+    """Return the scene of a seed, with random points in its volume; the first photograph has identity radiometry.
+
+    Parameters
+    ----------
+    seed : int
+    n_points, size : int
+        Points, and pixels of a photograph in width and height.
+    below : float
+        By how many metres the lowest altitude, which is the world's origin, is below the ground.
+    """
     rng = np.random.default_rng(seed)
     boxes, views, masks, radiometry = make_boxes(rng), [], [], []
     turned = rng.uniform(0, 2 * np.pi)
@@ -122,11 +131,12 @@ def make_scene(seed: int, n_points: int = 5000, size: int = SIZE) -> Truth:
         light = np.column_stack([C, rng.uniform(-0.05, 0.05, 3)]) if k else np.eye(3, 4)
         lit = np.where(is_shadow[..., None], SKY, 1) * (albedo @ light[:, :3].T + light[:, 3])
         image = np.clip(np.rint(255 * lit), 0, 255).astype(np.uint8)
-        views.append(View(f"{k:02d}", camera, image, None, view_id=k))
+        lowered = camera.cam_from_world_t - below / SCALE * camera.cam_from_world_R[:, 2] * [1, 1, 0]
+        views.append(View(f"{k:02d}", camera._replace(cam_from_world_t=lowered), image, None, view_id=k))
         masks.append(is_shadow)
         radiometry.append(light)
-    points = rng.uniform([-1.1, -1.1, LOW / SCALE], [1.1, 1.1, HIGH / SCALE], size=(n_points, 3))
+    points = rng.uniform([-1.1, -1.1, 0], [1.1, 1.1, (HIGH + below) / SCALE], size=(n_points, 3))
     frame = Frame((0.0, 0.0, 0.0), SCALE)
     scene = Scene("boxes", tuple(views), (), points, np.full((n_points, 3), 128, np.uint8), np.zeros(3), 1.0, frame)
     _, heights, _ = trace(boxes, zenith(size), None)
-    return Truth(scene, np.array(masks), np.array(radiometry), heights)
+    return Truth(scene, np.array(masks), np.array(radiometry), heights + below)

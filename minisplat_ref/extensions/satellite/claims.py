@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite.affine_fit import fit_residual
-from minisplat_ref.extensions.satellite.boxes import SCALE, SIZE, Truth, make_scene
+from minisplat_ref.extensions.satellite.boxes import HIGH, SCALE, SIZE, Truth, make_scene
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.extensions.satellite.surface_model import surface_model
 from minisplat_ref.rendering import Request
@@ -30,7 +30,9 @@ ARMS = (
     "an opaque start",
     "means at the rate of 3DGS",
     "a black background",
+    "limits 8 m below the ground",
 )
+PLANE, BELOW = "a plane", 8.0  # metres
 _TERMS = {ARMS[3]: "opacity_sparsity", ARMS[4]: "view_consistency", ARMS[5]: "shadow_entropy"}
 DISTANCES, OFF_NADIR = (500e3, 50e3, 5e3), (0.0, 25.0)  # metres, degrees
 GSD, SPAN, HEIGHT = 0.3, 500.0, 100.0  # metres
@@ -83,26 +85,29 @@ def measure(model: Model, truth: Truth) -> tuple[Measured, Floats]:
 
 
 def run_boxes(args: argparse.Namespace) -> kit.Report:
-    """Train every arm with every seed, which is also that of the scene."""
-    records: list[dict[str, Any]] = []
-    shown: dict[str, Floats] = {}
+    """Train every arm with every seed, which is also that of the scene; what is in ``--out`` already is kept."""
+    settings = kit.settings_of(args, "iterations")
+    jobs = [{"seed": seed, "arm": arm} for seed in range(args.seeds) for arm in ARMS]
+
+    def measure_job(seed: int, arm: str) -> list[dict[str, Any]]:
+        truth = make_scene(seed, below=BELOW if arm == ARMS[-1] else 0.0)
+        recipe, scene = arm_of(arm, find_recipe("satellite", args.iterations), truth.scene)
+        # Photographs without a sun in their cameras have no shadows; the truth's masks still do.
+        measured, heights = measure(train(scene, recipe, seed=seed).model, truth._replace(scene=scene))
+        if seed == 0:
+            np.save(args.out / f"{arm}.npy", heights.astype(np.float32))
+        return [measured._asdict()]
+
+    records = [record for record in kit.resume(args.out, settings, jobs, measure_job) if record["seed"] < args.seeds]
+    arms = kit.arms_of(records, "arm", Measured._fields)
+    planes = []
     for seed in range(args.seeds):
-        truth = make_scene(seed)
-        for arm in kit.with_progress(ARMS, f"seed {seed}"):
-            recipe, scene = arm_of(arm, find_recipe("satellite", args.iterations), truth.scene)
-            # Photographs without a sun in their cameras have no shadows; the truth's cameras still have one.
-            model = train(scene, recipe, seed=seed).model
-            measured, heights = measure(model, truth._replace(scene=scene))
-            records.append({"seed": seed, "arm": arm, **measured._asdict()})
-            if seed == 0:
-                shown.setdefault("truth", truth.heights)
-                shown[arm] = heights
-        flat = np.abs(truth.heights - np.median(truth.heights)).mean()
-        records.append({"seed": seed, "arm": "a plane", "height_mae": float(flat)})
-    trained = [record for record in records if record["arm"] != "a plane"]
-    result = {**kit.settings_of(args, "seeds", "iterations"), "records": records}
-    arms = kit.arms_of(trained, "arm", Measured._fields)
-    return kit.Report(result, draw(shown), table(records), arms)
+        heights = make_scene(seed).heights
+        planes.append({"seed": seed, "arm": PLANE, "height_mae": float(np.abs(heights - np.median(heights)).mean())})
+    records += planes
+    shown = {"truth": make_scene(0).heights, **{arm: np.load(args.out / f"{arm}.npy") for arm in ARMS}}
+    shown[ARMS[-1]] = shown[ARMS[-1]] - BELOW
+    return kit.Report({**settings, "seeds": args.seeds, "records": records}, draw(shown), table(records), arms)
 
 
 def table(records: list[dict[str, Any]]) -> str:
@@ -119,15 +124,18 @@ def table(records: list[dict[str, Any]]) -> str:
         for arm in sorted(ARMS, key=mae)
     ]
     heading = ["", "height MAE (m)", "shadow IoU", "gain error"]
-    plane = of("a plane", "height_mae", 2)
+    plane = of(PLANE, "height_mae", 2)
     return f"{markdown_table(heading, rows)}\n\na plane at the median height has an MAE of {plane} m"
 
 
 def draw(shown: dict[str, Floats]) -> Figure:
-    """Draw the heights of seed 0."""
-    figure = Figure(figsize=(2.2 * len(shown), 2.4), layout="constrained")
-    for ax, (name, heights) in zip(np.ravel(figure.subplots(1, len(shown))), shown.items(), strict=True):
-        show(ax, np.repeat(np.clip(heights / 24, 0, 1)[..., None], 3, axis=2), name)
+    """Draw the heights of seed 0: black is the ground, white 24 m."""
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    axes = np.ravel(figure.subplots(2, 6))
+    for ax in axes[len(shown) :]:
+        ax.axis("off")
+    for ax, (name, heights) in zip(axes, shown.items(), strict=False):
+        show(ax, np.repeat(np.clip(heights / HIGH, 0, 1)[..., None], 3, axis=2), name)
     return figure
 
 

@@ -87,8 +87,8 @@ def read_images(folder: Path, altitudes: tuple[float, float], n_points: int, see
         print(f"{path.name}: the affine camera is off by at most {fit.worst:.2f} px")
         camera = camera_of(fit.A, fit.b, *size, suns.get(path.stem))
         views.append(View(path.stem, camera, image[..., :3], None, view_id=k))
-    half = (altitudes[1] - altitudes[0]) / 2 / frame.scale
-    points = np.random.default_rng(seed).uniform([-1, -1, -half], [1, 1, half], size=(n_points, 3))
+    top = (altitudes[1] - altitudes[0]) / frame.scale
+    points = np.random.default_rng(seed).uniform([-1, -1, 0], [1, 1, top], size=(n_points, 3))
     place = Frame((float(frame.origin[0]), float(frame.origin[1]), float(frame.origin[2])), frame.scale)
     gray = np.full((n_points, 3), 128, np.uint8)
     scene = Scene(folder.name, tuple(views), (), points, gray, np.zeros(3), 1.0, place)
