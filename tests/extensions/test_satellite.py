@@ -11,7 +11,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite import affine_fit, boxes, reference, rpc, utm
 from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
-from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, fold_reference
+from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
 from minisplat_ref.oracle.pieces import tiny_setting
@@ -407,6 +407,30 @@ def test_boxes_truth():
     assert heights[48, 48] == pytest.approx(12) and heights[48, 60] == pytest.approx(0)
     dark = np.flatnonzero(is_shadow[48])
     assert (dark[0], dark[-1]) == (58, 69)  # pixels of a metre: x from 10 to 22 m
+
+
+def test_a_transparent_start():
+    """All have an opacity of 0.005 and half their size; the moments of the opacities, which point up, are forgotten."""
+    state = initial_state(boxes.make_scene(0, n_points=8, size=4).scene, find_recipe("satellite", 10), 0)
+    before = np.exp(state.gaussians.log_scales)
+    state.adam.first.opacity_logits[:] = 1
+    begin_transparent(state, None, opacity=0.005, size=0.5)
+    assert np.abs(1 / (1 + np.exp(-state.gaussians.opacity_logits)) - 0.005).max() < 1e-8  # float32
+    assert np.abs(np.exp(state.gaussians.log_scales) / before - 0.5).max() < 1e-6
+    assert not state.adam.first.opacity_logits.any()
+
+
+def test_limits_below_the_ground():
+    """The same photographs, of a world whose origin is 8 m lower: a point on the ground is seen at the same pixel."""
+    plain, low = (boxes.make_scene(0, n_points=50, size=8, below=below) for below in (0.0, 8.0))
+    assert np.abs(low.heights - plain.heights - 8).max() < EXACT * 100
+    assert low.scene.points[:, 2].max() > 30 / boxes.SCALE and low.scene.points.min(axis=0)[2] >= 0
+    for a, b in zip(plain.scene.train_views, low.scene.train_views, strict=True):
+        assert np.array_equal(a.image, b.image)
+        at = np.array([0.2, -0.3, 0.1])
+        seen = a.camera.cam_from_world_R @ at + a.camera.cam_from_world_t
+        moved = b.camera.cam_from_world_R @ np.add(at, [0, 0, 8 / boxes.SCALE]) + b.camera.cam_from_world_t
+        assert np.abs(moved - seen - [0, 0, -8]).max() < EXACT * 100  # the depth is minus the altitude
 
 
 def test_representation():

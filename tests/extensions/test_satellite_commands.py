@@ -66,6 +66,13 @@ def test_train_and_surface_model(trained, tmp_path):
     assert out.with_suffix(".png").exists()
 
 
+def test_points_fill_the_volume(images):
+    """From the lowest altitude, which is the origin, to the highest."""
+    scene, frame = read_images(images, (20.0, 80.0), 2000, 0)
+    z = scene.points[:, 2] * frame["scale"] + frame["origin"][2]
+    assert 20 <= z.min() < 21 and 79 < z.max() <= 80 and frame["origin"][2] == 20
+
+
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
