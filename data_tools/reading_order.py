@@ -165,6 +165,7 @@ ORDER = (
                 "small networks trained with a scene: opacities that depend on the view",
             ),
             Step(("extensions/segment/",), (), "labels of Gaussians from masks of photographs, by a vote"),
+            Step(("extensions/satellite/",), (), "affine cameras of satellites, the sun's shadows, surface models"),
             Step(
                 ("mechanisms/cameras/", "extensions/lens/", "extensions/wave/"),
                 (23,),

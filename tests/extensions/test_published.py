@@ -320,6 +320,38 @@ GAUSTUDIO = {
     ),
 }
 
+_OF_DENSITY = ("collect_gradients", "clone_and_split", "prune_", "reset_opacity", "sh_degree", "iterations")
+SATELLITE = {
+    **{name: row for name, row in GS.items() if not name.startswith(_OF_DENSITY)},
+    **rows(
+        "EOGS, released code",
+        iterations=5_000,
+        sh_degree=(0,),
+        opacity_sparsity=(0.1, 1),
+        shadow_entropy=(0.01, 1),
+        view_consistency__altitude=0.01,
+        view_consistency__color=0.1,
+        view_consistency__noise=0.01,
+        view_consistency__limit=0.3,
+    ),
+    **rows(
+        f"{OURS}: a transparent start, rates, pruning as in 3DGS, the light of the sky within bounds",
+        view_consistency=(1.0, 1),
+        rate__means=(6.4e-3, 6.4e-4, 5_000),
+        rate__opacity_logits=0.1,
+        rate__radiometry=0.001,
+        begin_transparent=[[1]],
+        begin_transparent__opacity=0.005,
+        begin_transparent__size=0.5,
+        rate__in_shadow=0.01,
+        prune_faint=[steps(600, 5_000, 100)],
+        prune_faint__min_opacity=0.005,
+        prune_faint__min_gap=20,
+        hold_sky=[steps(1, 5_000)],
+        fold_reference=[[5_000]],
+    ),
+}
+
 TABLES = {
     "3dgs": GS,
     "3dgs-accel": GS_ACCEL,
@@ -329,6 +361,7 @@ TABLES = {
     "mini-splatting2-d": MINI_SPLATTING2_D,
     "analytic": GS_ACCEL,
     "lens": GS_ACCEL,
+    "satellite": SATELLITE,
     "antialiasing": {name.replace("reset_opacity", "reset_smoothed_opacity"): row for name, row in GS_ACCEL.items()}
     | rows(
         "Mip-Splatting, equations (7) to (9) and released code",
@@ -573,6 +606,9 @@ CONSTANTS = [
     ("mechanisms.surfels.losses", "FAR", 100.0, "2DGS, released code"),
     ("texture_splat.reference", "REACH", 4.0, "TextureSplat, released code"),
     ("texture_splat.reference", "TILT_MAX", 0.99, "TextureSplat, released code"),
+    ("satellite.reference", "DARKENING", 0.4, "EOGS, released code"),
+    ("satellite.affine_fit", "GRID", (31, 37, 29), "EOGS, released code"),
+    ("satellite.method", "SKY_LIGHT", 0.05, "EOGS, released code"),
     ("textured.population", "DEGREE", 3, "Textured-GS, released code"),
     ("wave.hologram", "PITCH", 8.0, f"{OURS}: um, of displays of phases that can be bought"),
     ("wave.hologram", "WAVELENGTHS", (638.0, 520.0, 450.0), f"{OURS}: nm, of laser diodes"),

@@ -1,0 +1,240 @@
+"""The renderer of satellite photographs: splatting by an affine camera, a shadow map of the sun, radiometry; backwards.
+
+A camera with ``affine`` optics has A for its rotation and b for its translation, and the sun's shift in its
+coefficients. One without optics, or ``orthographic``, has parallel rays, and its focal lengths are pixels per world
+unit.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import SH_C0, Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.satellite.affine_fit import AFFINE
+from minisplat_ref.extensions.satellite.reference import (
+    AltitudeGradient,
+    ShadowTape,
+    altitudes,
+    altitudes_vjp,
+    light,
+    light_vjp,
+    shadows,
+    shadows_vjp,
+)
+from minisplat_ref.mechanisms.cameras.affine import AffineCamera, orthographic, with_affine
+from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, parameters_vjp
+from minisplat_ref.splatting import SplatGradient, SplatTape, splat, splat_vjp
+from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
+
+RADIOMETRY, IN_SHADOW = "radiometry", "in_shadow"  # shared: [V, 3, 4] and [V, 3]
+REFERENCE_VIEW = 0  # whose radiometry views have that are not trained on
+CHANNELS = {"depth": 1, "albedo": 3, "altitude": 1, "shadow": 1}  # besides rgb, in this order
+WANTS = frozenset({*CHANNELS, "stats", "median_depth"})
+
+
+def affine_of(camera: Camera, conventions: Conventions) -> AffineCamera:
+    """Return the affine camera of a camera.
+
+    Raises
+    ------
+    InputError
+        It bends directions.
+    """
+    if camera.optics is None or camera.optics.model == "orthographic":
+        return orthographic(camera, conventions)
+    if camera.optics.model != AFFINE:
+        raise InputError(f"satellite draws affine cameras, not {camera.optics.model} ones: train with --recipe lens")
+    return AffineCamera(camera.cam_from_world_R, camera.cam_from_world_t, camera.width, camera.height)
+
+
+def sun_shift(camera: Camera) -> tuple[float, float]:
+    """Return the pixels by which the sun shifts a unit of altitude; zeros where there is no sun, or in the zenith."""
+    coefficients = () if camera.optics is None else camera.optics.coefficients
+    return (coefficients[0], coefficients[1]) if len(coefficients) == 2 else (0.0, 0.0)
+
+
+def sheared(camera: AffineCamera, shift: tuple[float, float], margin: tuple[int, int]) -> AffineCamera:
+    """Return M A and M b, larger by a margin: what has altitude h moves by ``-g h``. The third row is ``-h``."""
+    A, b = (np.asarray(field, np.float64) for field in camera[:2])
+    M = np.eye(3)
+    M[:2, 2] = shift
+    return camera._replace(
+        cam_from_world_R=M @ A,
+        cam_from_world_t=M @ b + [*margin, 0],
+        width=camera.width + 2 * margin[0],
+        height=camera.height + 2 * margin[1],
+    )
+
+
+class Tape(NamedTuple):
+    """What :func:`render` keeps for :func:`render_vjp`."""
+
+    model: Model
+    row: int  # of the shared parameters
+    is_counted: bool  # whether there are any
+    camera: Camera
+    seen: SplatTape
+    of_sun: SplatTape | None
+    shadow: ShadowTape | None
+    shadow_map: Floats  # [H, W] s
+    radiometry: Floats  # [3, 4]
+    in_shadow: Floats  # [3]
+    wants: frozenset[str]
+
+
+def channels(wants: frozenset[str]) -> dict[str, slice]:
+    """Return the image's channels: ``rgb``, then ``depth``, ``albedo``, ``altitude`` and ``shadow`` as wanted."""
+    found, start = {"rgb": slice(0, 3)}, 3
+    for name, size in CHANNELS.items():
+        if name in wants:
+            found[name] = slice(start, start + size)
+            start += size
+    return found
+
+
+def splat_view(model: Any, camera: AffineCamera, request: Request, *, has_color: bool = True) -> SplatTape:
+    """Return the splatting of a view: colours, which do not depend on the direction, and depths.
+
+    Parameters
+    ----------
+    model : Model
+    camera : AffineCamera
+    request : Request
+    has_color : bool
+        Colours are 0 without.
+    """
+    g, dtype = model.gaussians, model.gaussians.means.dtype
+    background = np.zeros(3, dtype) if request.background is None or not has_color else request.background.astype(dtype)
+
+    def shade(radii: Ints) -> Floats:
+        return np.maximum(SH_C0 * g.sh_dc + 0.5, 0).astype(dtype) if has_color else np.zeros_like(g.sh_dc)
+
+    return splat(
+        activate(g, request.is_visible),
+        shade,
+        camera,  # type: ignore[arg-type]  # the stages read its size, and the projection is affine
+        background,
+        request.conventions,
+        with_affine(request.backend),
+        with_depth=True,
+        with_stats=has_color and "stats" in request.wants,
+        with_median_depth=has_color and "median_depth" in request.wants,
+    )
+
+
+def splat_view_vjp(model: Model, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> tuple[Any, SplatGradient]:
+    """Gradient of :func:`splat_view` with respect to the population; the splats' own comes second."""
+    g = model.gaussians
+    v = splat_vjp(tape, v_image, v_alpha)
+    is_lit = SH_C0 * g.sh_dc + 0.5 > 0
+    v_dc = np.where(is_lit, SH_C0 * v.colors, 0).astype(g.sh_dc.dtype)
+    nothing = np.zeros_like(g.means)
+    v_sh = SHGradient(nothing, v_dc, np.zeros_like(g.sh_rest), np.zeros((3, 3)), np.zeros(3))
+    return parameters_vjp(g, tape.primitives, v.primitives, v_sh), v
+
+
+def depth_sums(tape: SplatTape) -> tuple[Floats, Floats]:
+    """Return ``sum w z`` and alpha, [H, W] each."""
+    return np.ascontiguousarray(tape.output.image[..., 3]), tape.output.alpha
+
+
+def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Tape]:
+    """Render a photograph with its light; return the image and a tape.
+
+    Raises
+    ------
+    InputError
+        Something is wanted that needs perspective, or the camera bends directions.
+    """
+    if request.wants - WANTS:
+        names = ", ".join(sorted(request.wants - WANTS))
+        raise InputError(f"satellite does not give {names}: use a recipe that does not ask for it, such as satellite")
+    camera, dtype = affine_of(view.camera, request.conventions), model.gaussians.means.dtype
+    seen = splat_view(model, camera, request)
+    sums, alpha = depth_sums(seen)
+    h = altitudes(sums, alpha)
+    shift, of_sun, shadow = sun_shift(view.camera), None, None
+    s = np.ones_like(alpha)
+    if shift != (0.0, 0.0):
+        margin = camera.width // 2, camera.height // 2
+        of_sun = splat_view(model, sheared(camera, shift, margin), request, has_color=False)
+        shadow = shadows(h, altitudes(*depth_sums(of_sun)), shift, margin)
+        s = shadow.shadows
+    is_counted, row = RADIOMETRY in model.shared, max(view.view_id, REFERENCE_VIEW)
+    radiometry = (model.shared[RADIOMETRY][row] if is_counted else np.eye(3, 4)).astype(dtype)
+    in_shadow = (model.shared[IN_SHADOW][row] if is_counted else np.zeros(3)).astype(dtype)
+    albedo = np.ascontiguousarray(seen.output.image[..., :3])
+    parts = {"depth": sums[..., None], "albedo": albedo, "altitude": h[..., None], "shadow": s[..., None]}
+    image = np.concatenate(
+        [light(albedo, s, radiometry, in_shadow), *(parts[name] for name in CHANNELS if name in request.wants)], axis=2
+    )
+    visible_ids = np.flatnonzero(seen.projection.radii[:, 0] > 0)
+    n_pairs = len(seen.bins.gaussian_ids) + (0 if of_sun is None else len(of_sun.bins.gaussian_ids))
+    output = seen.output._replace(image=image, visible_ids=visible_ids, n_pairs=n_pairs)
+    tape = Tape(
+        model, row, is_counted, view.camera, seen, of_sun, shadow, s, radiometry, in_shadow, request.wants
+    )  # fmt: skip
+    return output, tape
+
+
+def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render`: light, then shadows, then the two splattings.
+
+    Altitudes have gradients from their channel, from the shadows as what is shaded and, in the sun's image, as what
+    shades. Both splattings add to the population and, through ``M A``, to the pose: ``v_A += M^T v_MA``.
+    """
+    where = channels(tape.wants)
+    v = {name: np.ascontiguousarray(v_image[..., part]) for name, part in where.items()}
+    sums, alpha = depth_sums(tape.seen)
+    v_alpha = np.zeros_like(alpha) if v_alpha is None else v_alpha
+    albedo = np.ascontiguousarray(tape.seen.output.image[..., :3])
+    of_light = light_vjp(albedo, tape.shadow_map, tape.radiometry, tape.in_shadow, v["rgb"])
+    v_h = v["altitude"][..., 0] if "altitude" in v else np.zeros_like(alpha)
+    v_albedo = of_light.albedo + (v["albedo"] if "albedo" in v else 0)
+    sun = None
+    if tape.shadow is not None and tape.of_sun is not None:
+        v_s = of_light.shadows + (v["shadow"][..., 0] if "shadow" in v else 0)
+        v_shaded, v_of_sun = shadows_vjp(tape.shadow, v_s)
+        v_h = v_h + v_shaded
+        sun = _through_altitudes(tape.model, tape.of_sun, v_of_sun, None)
+    of_h = altitudes_vjp(sums, alpha, v_h)
+    of_h = AltitudeGradient(of_h.sums + (v["depth"][..., 0] if "depth" in v else 0), of_h.alpha + v_alpha)
+    gaussians, of_splats = _splat_vjp(tape.model, tape.seen, of_h, v_albedo)
+    v_A, v_b = of_splats.primitives.cam_from_world_R, of_splats.primitives.cam_from_world_t
+    if sun is not None:
+        gaussians = type(gaussians)(*(a + b for a, b in zip(gaussians, sun[0], strict=True)))
+        M = np.eye(3)
+        M[:2, 2] = sun_shift(tape.camera)
+        v_A = v_A + M.T @ sun[1].primitives.cam_from_world_R
+        v_b = v_b + M.T @ sun[1].primitives.cam_from_world_t
+    if tape.camera.optics is None or tape.camera.optics.model != AFFINE:
+        per_unit = np.array([tape.camera.fx, tape.camera.fy, 1.0])
+        v_A, v_b = per_unit[:, None] * v_A, per_unit * v_b
+    shared = {}
+    if tape.is_counted:
+        shared = {name: np.zeros_like(tape.model.shared[name]) for name in (RADIOMETRY, IN_SHADOW)}
+        shared[RADIOMETRY][tape.row], shared[IN_SHADOW][tape.row] = of_light.radiometry, of_light.in_shadow
+    return RenderGradient(
+        gaussians, of_splats.background, v_A.astype(alpha.dtype), v_b.astype(alpha.dtype), of_splats.means2d, shared
+    )
+
+
+def _through_altitudes(
+    model: Model, tape: SplatTape, v_altitudes: Floats, v_color: Floats | None
+) -> tuple[Any, SplatGradient]:
+    """Return the gradient of a splatting from that of its altitudes and, if there is one, of its colours."""
+    sums, alpha = depth_sums(tape)
+    return _splat_vjp(model, tape, altitudes_vjp(sums, alpha, v_altitudes), v_color)
+
+
+def _splat_vjp(
+    model: Model, tape: SplatTape, of_h: AltitudeGradient, v_color: Floats | None
+) -> tuple[Any, SplatGradient]:
+    v_color = np.zeros((*of_h.alpha.shape, 3), of_h.alpha.dtype) if v_color is None else v_color
+    v_image = np.ascontiguousarray(np.concatenate([v_color, of_h.sums[..., None]], axis=2))
+    return splat_view_vjp(model, tape, v_image, np.ascontiguousarray(of_h.alpha))
+
+
+SATELLITE = Renderer("satellite", render, render_vjp, channels)
+"""Draws photographs with their light; without a sun and with identity radiometry, this is plain splatting."""

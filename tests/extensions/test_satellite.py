@@ -1,0 +1,438 @@
+"""Satellite: closed forms of RPCs, UTM, shadows and light; gradients; the degenerate case; bad input."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.satellite import affine_fit, boxes, reference, rpc, utm
+from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
+from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference
+from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
+from minisplat_ref.oracle.pieces import tiny_setting
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.losses import Rendered
+from minisplat_ref.types import Camera, Model, Optics, view_from
+
+EXACT = 1e-12  # float64, a few operations
+FINE = 1e-8  # central differences of step 1e-5 on values near 1
+
+
+# --- UTM and RPC ---
+
+
+def test_utm_of_a_known_tower():
+    """The CN Tower, 43 38 33.24 N, 79 23 13.7 W, is at 630084 E, 4833438 N of zone 17, to the metre."""
+    longitude, latitude = -(79 + 23 / 60 + 13.7 / 3600), 43 + 38 / 60 + 33.24 / 3600
+    assert utm.zone_of(longitude) == 17
+    found = utm.utm_from_degrees(np.array([longitude]), np.array([latitude]), 17, is_south=False)
+    assert np.abs(found - [630_084, 4_833_438]).max() < 1
+
+
+def test_utm_of_a_meridian():
+    """On its central meridian a zone is 0.9996 times the arc, 4,984,944.378 m to 45 degrees; south begins at 10^7."""
+    found = utm.utm_from_degrees(np.full(2, 9.0), np.array([45.0, -45.0]), 32, is_south=False)
+    arc = 0.9996 * 4_984_944.378
+    assert np.abs(found - [[500_000, arc], [500_000, -arc]]).max() < 1e-3
+    south = utm.utm_from_degrees(np.full(1, 9.0), np.array([-45.0]), 32, is_south=True)
+    assert south[0, 1] == pytest.approx(1e7 - arc, abs=1e-3)
+    with pytest.raises(InputError, match="84 degrees"):
+        utm.utm_from_degrees(np.zeros(1), np.array([85.0]), 31, is_south=False)
+
+
+def make_rpc(curved=0.0):
+    """An RPC over 600 m in Rome, 0.5 m pixels, which a height shifts; ``curved`` adds cubics and a denominator."""
+    numerators, denominators = np.zeros((2, 20)), np.zeros((2, 20))
+    denominators[:, 0] = 1
+    numerators[0, [1, 2, 3]] = 1.0, 0.1, 0.2  # sample: L, P, H
+    numerators[1, [1, 2, 3]] = 0.1, -1.0, -0.1
+    numerators[:, 10:] += curved
+    denominators[:, 1:4] += curved
+    degrees = 300 / 111_320
+    return rpc.RPC(
+        np.array([12.5, 41.9, 50.0]),
+        np.array([degrees / np.cos(np.radians(41.9)), degrees, 100.0]),
+        np.array([600.0, 600.0]),
+        np.array([600.0, 600.0]),
+        numerators,
+        denominators,
+    )
+
+
+def text_of(r, style="txt"):
+    """The text of an RPC."""
+    names = [
+        *zip(("LONG", "LAT", "HEIGHT"), r.ground_offset, r.ground_scale, strict=True),
+        *zip(("SAMP", "LINE"), r.pixel_offset, r.pixel_scale, strict=True),
+    ]
+    lists = {
+        "SAMP_NUM_COEFF": r.numerators[0],
+        "LINE_NUM_COEFF": r.numerators[1],
+        "SAMP_DEN_COEFF": r.denominators[0],
+        "LINE_DEN_COEFF": r.denominators[1],
+    }
+    flat = {f"{name}_{end}": value for name, *both in names for end, value in zip(("OFF", "SCALE"), both, strict=True)}
+    if style == "txt":
+        lines = [f"{name}: {float(value)!r} degrees" for name, value in flat.items()]
+        lines += [f"{name}_{k}: {float(v)!r}" for name, values in lists.items() for k, v in enumerate(values, 1)]
+        return "\n".join(lines)
+    back = {theirs: ours for ours, theirs in rpc._RPB_NAMES.items()}
+    lines = [f"  {back[name]} = {float(value)!r};" for name, value in flat.items()]
+    for name, values in lists.items():
+        rows = ",\n".join(repr(float(v)) for v in values)
+        lines.append(f"  {back[name]} = (\n{rows});")
+    return 'satId = "X";\nBEGIN_GROUP = IMAGE\n' + "\n".join(lines) + "\nEND_GROUP = IMAGE\nEND;"
+
+
+def test_monomials_have_the_order_of_rpc00b():
+    """Each coefficient alone, at L, P, H = 2, 3, 5, by hand."""
+    m, _ = rpc._monomials(np.array([[2.0, 3.0, 5.0]]))
+    assert m[0].tolist() == [1, 2, 3, 5, 6, 10, 15, 4, 9, 25, 30, 8, 18, 50, 12, 27, 75, 20, 45, 125]
+
+
+def test_derivatives_of_monomials():
+    x, h = np.array([[0.3, -0.7, 0.4]]), 1e-6
+    _, dm = rpc._monomials(x)
+    for k in range(3):
+        step = h * np.eye(3)[k]
+        difference = (rpc._monomials(x + step)[0] - rpc._monomials(x - step)[0]) / (2 * h)
+        assert np.abs(dm[:, k] - difference).max() < FINE
+
+
+def test_projection_by_hand():
+    """A scale of latitude north is 600 lines up and 60 samples right; the middle's centre is at 600.5."""
+    r = make_rpc()
+    ground = np.array([r.ground_offset, r.ground_offset + np.array([0, r.ground_scale[1], 0])])
+    assert np.abs(rpc.project(r, ground) - [[600.5, 600.5], [660.5, 0.5]]).max() < 1e-9
+
+
+def test_localisation_inverts_projection():
+    r = make_rpc(0.01)
+    rng = np.random.default_rng(0)
+    pixels, heights = rng.uniform(0, 1200, (50, 2)), rng.uniform(0, 100, 50)
+    ground = rpc.localise(r, pixels, heights)
+    assert np.abs(rpc.project(r, ground) - pixels).max() < 1e-6
+    assert np.abs(ground[:, 2] - heights).max() < EXACT * 100
+
+
+def test_localisation_refuses_what_has_no_inverse():
+    r = make_rpc()
+    with pytest.raises(InputError, match="cannot be inverted"):
+        rpc.localise(r._replace(numerators=np.ones((2, 20))), np.array([[3.0, 5.0]]), np.zeros(1))
+
+
+@pytest.mark.parametrize("style", ["txt", "rpb"])
+def test_texts_are_read(tmp_path, style):
+    r, image = make_rpc(0.01), tmp_path / "a.png"
+    (tmp_path / ("a_RPC.TXT" if style == "txt" else "a.RPB")).write_text(text_of(r, style))
+    found = rpc.read_rpc(image)
+    assert all(np.array_equal(a, b) for a, b in zip(found, r, strict=True))
+
+
+def test_bad_texts_are_refused(tmp_path):
+    text = text_of(make_rpc())
+    for bad, message in (
+        (text.replace("HEIGHT_OFF", "HIGHT_OFF"), "HEIGHT_OFF"),
+        (text.replace("LINE_DEN_COEFF_20", "LINE_DEN_COEFF_21"), "out of order"),
+        (text.replace("LAT_SCALE: ", "LAT_SCALE: 0 # "), "scale of the RPC is 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            rpc.parse_rpc(bad, tmp_path / "x_RPC.TXT")
+    with pytest.raises(InputError, match=r"no RPC; put b_RPC\.TXT beside it"):
+        rpc.read_rpc(tmp_path / "b.png")
+
+
+# --- the affine fit ---
+
+
+def perspective(distance, gsd=0.3, size=500.0):
+    """World points that pixels of a camera straight above see at altitudes of -50 to 50 m."""
+    n = round(size / gsd)
+
+    def world_of(pixels, altitudes):
+        flat = (pixels - n / 2) * gsd * (distance - altitudes)[:, None] / distance
+        return np.column_stack([flat * [1, -1], altitudes])
+
+    return partial(affine_fit.fit_affine, world_of, n, n, (-50.0, 50.0), "photo")
+
+
+def test_residual_of_a_perspective_camera():
+    """A corner 353 m off the axis moves by 353 / 0.3 x 50 / 500,000 pixels between the middle and the top."""
+    fit = perspective(500e3)()
+    assert fit.worst == pytest.approx(353.5 / 0.3 * 50 / 500e3, rel=0.01)
+    assert np.abs(fit.A[2] - [0, 0, 1]).max() < 1e-9  # the third row is the altitude
+    with pytest.raises(InputError, match=r"photo: .*leaves 11.8 pixels"):
+        perspective(5e3)()
+
+
+def test_fit_of_an_rpc():
+    """An RPC without curvature is affine in degrees; UTM bends it by 0.03 pixels."""
+    r = make_rpc()
+    frame = affine_fit.frame_of([r], (1200, 1200), (0.0, 100.0))
+    assert (frame.zone, frame.is_south) == (33, False)
+    fit = affine_fit.fit_rpc(r, frame, (1200, 1200), (0.0, 100.0), "a")
+    assert fit.worst < 0.04
+    ground = rpc.localise(r, np.array([[100.0, 900.0]]), np.array([80.0]))
+    place = utm.utm_from_degrees(ground[:, 0], ground[:, 1], frame.zone, is_south=False)
+    x = (np.append(place[0], 80.0) - frame.origin) / frame.scale
+    assert np.abs(fit.A @ x + fit.b - [100, 900, 80 - frame.origin[2]]).max() < 0.05
+    with pytest.raises(InputError, match=r"curved: .* pixels"):
+        affine_fit.fit_rpc(make_rpc(0.01), frame, (1200, 1200), (0.0, 100.0), "curved")
+
+
+def test_altitudes_have_to_be_a_range():
+    with pytest.raises(InputError, match="--altitudes LOW,HIGH"):
+        affine_fit.check_altitudes(None)
+    for bad in ((5.0, 5.0), (3.0, 1.0), (0.0, np.nan)):
+        with pytest.raises(InputError, match="no range"):
+            affine_fit.check_altitudes(bad)
+    with pytest.raises(InputError, match="horizon"):
+        affine_fit.camera_of(np.eye(3), np.zeros(3), 4, 4, np.array([1.0, 0, 0]))
+
+
+# --- light ---
+
+
+def test_shadow_by_hand():
+    """The sun at 45 degrees in the west: 2 m east of a wall of 2 m the ground is dark as exp(-0.8), 3 m it is lit."""
+    of_sun = np.zeros((1, 12))
+    of_sun[0, 4] = 2.0  # the roof, where the sun's ray arrives that passes it
+    tape = reference.shadows(np.zeros((1, 4)), of_sun, (-1.0, 0.0), (4, 0))
+    assert np.abs(tape.shadows - [[np.exp(-0.8), 1, 1, 1]]).max() < EXACT
+    high = np.array([[0.0, 0.0, 2.0, 0.0]])  # pixel 2, 2 m high, is read 2 pixels to the right, at 4 + 2 + 2
+    of_sun[0, 8] = 3.0
+    tape = reference.shadows(high, of_sun, (-1.0, 0.0), (4, 0))
+    assert tape.shadows[0, 2] == pytest.approx(np.exp(-0.4))
+
+
+def test_light_by_hand():
+    radiometry = np.column_stack([np.diag([1.0, 2.0, 0.5]), [0.1, 0.0, 0.2]])
+    found = reference.light(np.full((1, 2, 3), 0.4), np.array([[1.0, 0.5]]), radiometry, np.array([0.0, 0.5, 1.0]))
+    assert np.abs(found[0] - [[0.5, 0.8, 0.4], [0.25, 0.6, 0.4]]).max() < EXACT
+
+
+@pytest.mark.parametrize("name", ["altitudes", "shadows", "light"])
+def test_gradients(name):
+    """Every entry against central differences."""
+    rng = np.random.default_rng(1)
+    h, of_sun = rng.uniform(0, 2, (4, 5)), rng.uniform(0, 3, (8, 9))
+    arguments, function, gradient = {
+        "altitudes": (
+            (h, rng.uniform(0.02, 0.9, (4, 5))),
+            reference.altitudes,
+            lambda v, *a: reference.altitudes_vjp(*a, v),
+        ),
+        "shadows": (
+            (h, of_sun),
+            lambda a, b: reference.shadows(a, b, (0.7, -0.4), (2, 2)).shadows,
+            lambda v, a, b: reference.shadows_vjp(reference.shadows(a, b, (0.7, -0.4), (2, 2)), v),
+        ),
+        "light": (
+            (rng.uniform(size=(4, 5, 3)), rng.uniform(size=(4, 5)), rng.normal(size=(3, 4)), rng.uniform(size=3)),
+            reference.light,
+            lambda v, *a: reference.light_vjp(*a, v),
+        ),
+    }[name]
+    v = rng.normal(size=function(*arguments).shape)
+    for k, found in enumerate(gradient(v, *arguments)):
+        expected = np.zeros_like(arguments[k])
+        for index in np.ndindex(*expected.shape):
+            sides = []
+            for sign in (1, -1):
+                moved = [a.copy() for a in arguments]
+                moved[k][index] += sign * 1e-6
+                sides.append(np.sum(v * function(*moved)))
+            expected[index] = (sides[0] - sides[1]) / 2e-6
+        assert np.abs(expected).max() > 0.01
+        assert np.abs(found - expected).max() < FINE
+
+
+def test_slopes_at_the_kinks():
+    """On a kink the gradient is the slope of one side: lit where h = h_s, the right cell on a border between cells."""
+    of_sun, d = np.array([[1.0, 3.0, 2.0]]), 1e-6
+
+    def shadow(h):  # of a pixel over the sun's middle one
+        return reference.shadows(np.full((1, 1), h), of_sun, (0.0, 0.0), (1, 0))
+
+    at = shadow(3.0)
+    right, left = (shadow(3.0 + d).shadows - at.shadows) / d, (at.shadows - shadow(3.0 - d).shadows) / d
+    assert right[0, 0] == 0 and left[0, 0] == pytest.approx(reference.DARKENING, rel=1e-5)
+    assert [float(v.sum()) for v in reference.shadows_vjp(at, np.ones((1, 1)))] == [0, 0]
+    image, x, y = of_sun[..., None], np.full((1, 1), 1.5), np.full((1, 1), 0.5)
+    read = reference.sample(image, x, y)
+    sides = [(reference.sample(image, x + sign * d, y).values - read.values)[0, 0, 0] / (sign * d) for sign in (1, -1)]
+    assert sides == pytest.approx([-1.0, 2.0])
+    assert reference.sample_vjp(read, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == pytest.approx(-1.0)
+    edge = reference.sample(image, x + 1, y)  # the last centre: constant beyond it
+    assert reference.sample_vjp(edge, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == 0
+
+
+# --- the renderer ---
+
+
+@pytest.fixture(scope="module")
+def setting():
+    """A tiny scene seen by parallel rays."""
+    found = tiny_setting(GSPLAT_MAIN)
+    camera = found.camera._replace(fx=found.camera.fx / 3, fy=found.camera.fy / 3)
+    flat = found.gaussians._replace(sh_rest=found.gaussians.sh_rest[:, :0])
+    return found._replace(camera=camera, gaussians=flat)
+
+
+@pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=lambda b: b.name)
+def test_without_sun_and_radiometry_it_is_plain_splatting(setting, backend):
+    """The same bytes as splatting by an orthographic camera, image and gradients."""
+    model, view = Model(setting.gaussians), view_from(setting.camera)
+    request = Request(setting.background, wants=frozenset({"depth"}), backend=backend)
+    lit = Model(setting.gaussians, {RADIOMETRY: np.eye(3, 4)[None], IN_SHADOW: np.full((1, 3), 0.05)})
+    found, tape = SATELLITE.render(lit, view, request)
+    plain_request = request._replace(backend=with_affine(backend, orthographic))
+    plain, plain_tape = SPLATTING.render(model, view, plain_request)
+    assert np.array_equal(found.image, plain.image)
+    v = np.random.default_rng(0).normal(size=plain.image.shape)
+    ours, theirs = SATELLITE.render_vjp(tape, v, None), SPLATTING.render_vjp(plain_tape, v)
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh_dc"):
+        expected = getattr(theirs.gaussians, name)
+        assert np.abs(getattr(ours.gaussians, name) - expected).max() <= 1e-13 * np.abs(expected).max()
+
+
+def test_a_lone_gaussian_does_not_shade_itself(setting):
+    """A tie, not a kink: h and h_s are equal but for rounding, s is 1, and what both get from it cancels."""
+    g = type(setting.gaussians)(*(field[:1] for field in setting.gaussians))
+    g = g._replace(means=np.array([[0.0, 0.0, 0.3]]), opacity_logits=np.array([4.0]))
+    camera = boxes.zenith(24)._replace(optics=Optics("affine", (0.31, -0.17)))
+    camera = camera._replace(cam_from_world_R=camera.cam_from_world_R * [[1.0], [1.0], [1 / boxes.SCALE]])
+    request = Request(backend=REFERENCE, wants=frozenset({"shadow"}))
+    output, tape = SATELLITE.render(Model(g), view_from(camera), request)
+    shadow = output.image[..., 3]
+    is_seen = output.alpha > 0.2  # both altitudes are those of the Gaussian
+    assert is_seen.sum() > 20 and np.abs(shadow[is_seen] - 1).max() < EXACT
+    v = np.zeros_like(output.image)
+    v[..., 3] = is_seen
+    found = SATELLITE.render_vjp(tape, v).gaussians
+    assert max(np.abs(field).max() for field in found if field.size) < EXACT * is_seen.sum()
+
+
+def test_a_roof_hides_the_sun():
+    """A slab 10 m above the ground throws its shadow where the sun says, and only there; rows are of the photograph."""
+    rng = np.random.default_rng(0)
+    truth = boxes.make_scene(0, n_points=10, size=16)
+    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 24)] * 2), axis=-1).reshape(-1, 2)
+    ground = np.column_stack([grid, np.zeros(len(grid))])
+    roof = ground[np.abs(grid).max(axis=1) < 0.3] + [0, 0, 10 / boxes.SCALE]
+    means = np.concatenate([ground, roof])
+    n = len(means)
+    g = state.gaussians._replace(
+        means=means,
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        log_scales=np.log(np.tile([0.06, 0.06, 0.002], (n, 1))),
+        opacity_logits=np.full(n, 5.0),
+        sh_dc=rng.normal(size=(n, 3)) * 0,
+        sh_rest=np.zeros((n, 0, 3)),
+    )
+    zenith = boxes.zenith(16)
+    camera = zenith._replace(optics=Optics("affine", (-4 / 10, 0.0)))  # 4 pixels for 10 m, from the west
+    model = Model(g, {RADIOMETRY: np.tile(np.eye(3, 4), (2, 1, 1)), IN_SHADOW: np.array([[0.9] * 3, [0.2] * 3])})
+    request = Request(backend=REFERENCE, wants=frozenset({"shadow", "albedo", "altitude"}))
+    view = view_from(camera)._replace(view_id=1)
+    image = SATELLITE.render(model, view, request)[0].image
+    shadow, h = image[..., -1], image[..., 6]
+    assert h[8, 8] == pytest.approx(10, abs=0.5) and abs(h[8, 1]) < 0.5
+    assert shadow[8, 12] < 0.1 and shadow[8, 3] > 0.9 and shadow[8, 8] > 0.9
+    expected = (shadow + (1 - shadow) * 0.2)[..., None] * image[..., 3:6]
+    assert np.abs(image[..., :3] - expected).max() < EXACT
+
+
+def test_folding_changes_no_photograph(setting):
+    """Colours take over the reference's radiometry: an opaque scene looks the same in every photograph."""
+    truth = boxes.make_scene(0, n_points=4, size=8)
+    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
+    rng = np.random.default_rng(3)
+    state.gaussians = state.gaussians._replace(
+        log_scales=np.full_like(state.gaussians.log_scales, 1.0),
+        opacity_logits=np.full_like(state.gaussians.opacity_logits, 9.0),
+        sh_dc=rng.uniform(-0.3, 0.3, state.gaussians.sh_dc.shape).astype(np.float32),
+    )
+    state.shared[RADIOMETRY] += 0.1 * rng.normal(size=state.shared[RADIOMETRY].shape).astype(np.float32)
+    views, request = truth.scene.train_views, Request(backend=REFERENCE)
+    before = [SATELLITE.render(state.model, view, request)[0].image for view in views]
+    assert fold_reference(state, None) is None
+    assert np.abs(state.shared[RADIOMETRY][0] - np.eye(3, 4)).max() < 1e-6
+    assert np.abs(state.shared[RADIOMETRY][1] - np.eye(3, 4)).max() > 0.05
+    after = [SATELLITE.render(state.model, view, request)[0].image for view in views]
+    assert np.abs(np.array(after) - before).max() < 1e-3  # 1 - alpha of 1e-4, and float32
+
+
+def test_loss_terms_by_hand(setting):
+    truth = boxes.make_scene(0, n_points=8, size=4)
+    g = setting.gaussians._replace(opacity_logits=np.array([0.0, np.log(3.0)]))
+    output = SATELLITE.render(Model(setting.gaussians), view_from(setting.camera), Request(backend=REFERENCE))[0]
+    s = np.array([[0.5, 1.0], [0.25, 0.0]])[..., None]
+    rendered = Rendered(
+        output._replace(image=s),
+        {"shadow": slice(0, 1)},
+        truth.scene.train_views[0],
+        truth.scene,
+        Model(g),
+        1,
+        Request(),
+    )
+    assert opacity_sparsity(rendered)[0] == pytest.approx((0.5 + 0.75) / 8)
+    entropy = np.log(2) + 0.25 * np.log(4) + 0.75 * np.log(4 / 3)
+    value, v = shadow_entropy(rendered)
+    assert value == pytest.approx(entropy / 4)
+    assert v.channels["shadow"].ravel().tolist() == pytest.approx([0.0, 0.0, np.log(3) / 4, 0.0])
+
+
+def test_other_cameras_are_refused(setting):
+    bent = setting.camera._replace(optics=Optics("fisheye", (0.0,) * 4))
+    with pytest.raises(InputError, match="affine cameras, not fisheye"):
+        SATELLITE.render(Model(setting.gaussians), view_from(bent), Request())
+    with pytest.raises(InputError, match="does not give surface"):
+        SATELLITE.render(Model(setting.gaussians), view_from(setting.camera), Request(wants=frozenset({"surface"})))
+
+
+def test_boxes_truth():
+    """Heights are those of the boxes, walls are seen at a slant, and a shadow has the length that the sun says."""
+    box = boxes.Boxes(np.array([[-10.0, -10, 0]]), np.array([[10.0, 10, 12]]), np.ones((2, 2, 3)))
+    sun = np.array([-1.0, 0.0, 1.0])
+    _, heights, is_shadow = boxes.trace(box, boxes.zenith(96), sun)
+    assert heights[48, 48] == pytest.approx(12) and heights[48, 60] == pytest.approx(0)
+    dark = np.flatnonzero(is_shadow[48])
+    assert (dark[0], dark[-1]) == (58, 69)  # pixels of a metre: x from 10 to 22 m
+
+
+def test_a_transparent_start():
+    """All have an opacity of 0.005 and half their size; the moments of the opacities, which point up, are forgotten."""
+    state = initial_state(boxes.make_scene(0, n_points=8, size=4).scene, find_recipe("satellite", 10), 0)
+    before = np.exp(state.gaussians.log_scales)
+    state.adam.first.opacity_logits[:] = 1
+    begin_transparent(state, None, opacity=0.005, size=0.5)
+    assert np.abs(1 / (1 + np.exp(-state.gaussians.opacity_logits)) - 0.005).max() < 1e-8  # float32
+    assert np.abs(np.exp(state.gaussians.log_scales) / before - 0.5).max() < 1e-6
+    assert not state.adam.first.opacity_logits.any()
+
+
+def test_limits_below_the_ground():
+    """The same photographs, of a world whose origin is 8 m lower: a point on the ground is seen at the same pixel."""
+    plain, low = (boxes.make_scene(0, n_points=50, size=8, below=below) for below in (0.0, 8.0))
+    assert np.abs(low.heights - plain.heights - 8).max() < EXACT * 100
+    assert low.scene.points[:, 2].max() > 30 / boxes.SCALE and low.scene.points.min(axis=0)[2] >= 0
+    for a, b in zip(plain.scene.train_views, low.scene.train_views, strict=True):
+        assert np.array_equal(a.image, b.image)
+        at = np.array([0.2, -0.3, 0.1])
+        seen = a.camera.cam_from_world_R @ at + a.camera.cam_from_world_t
+        moved = b.camera.cam_from_world_R @ np.add(at, [0, 0, 8 / boxes.SCALE]) + b.camera.cam_from_world_t
+        assert np.abs(moved - seen - [0, 0, -8]).max() < EXACT * 100  # the depth is minus the altitude
+
+
+def test_representation():
+    assert SEEN_FROM_ABOVE.takes_optics
+    assert isinstance(boxes.zenith(), Camera)
