@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from data_tools.foreign_files.dialects import as_version_4
+from data_tools.foreign_files.ksplat import write_ksplat
 from data_tools.fuzz.mutations import Choose, damage
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
@@ -174,6 +175,8 @@ def _write_compact(folder: Path) -> None:
     for _, format_ in all_formats():
         for level in range(len(format_.levels)):
             (folder / f"compact-{level}{format_.suffix}").write_bytes(format_.encode(gaussians, level))
+    for level in range(3):
+        (folder / f"compact-{level}.ksplat").write_bytes(write_ksplat(gaussians, level))
     (folder / "compact-4.spz").write_bytes(as_version_4((folder / "compact-0.spz").read_bytes()))
 
 

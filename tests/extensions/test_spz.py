@@ -40,7 +40,7 @@ def test_spz_by_hand():
     assert raw[29:32] == bytes([0, 64, 255])
     assert raw[32:36] == bytes([0, 0, 0, 0b11000000])  # w, the last of x, y, z, w, is largest
     assert raw[36:] == bytes([96, 128, 160, 128, 128, 128, 128, 136, 128])  # -32, 32; 3 and 5
-    raw = spz_raw(gaussians._replace(quats=np.array([[-1.0, 0.0, 1.0, 0.0]], np.float32)), 1)
+    raw = spz_raw(gaussians._replace(quats=np.array([[-1.0, 0.0, 1.0, 0.0]], np.float32)), 2)
     assert raw[4] == 2 and raw[32:35] == bytes([128, 218, 128])  # -w, so y changes sign twice: 127.5 (1 + 0.7071)
 
 
@@ -52,7 +52,7 @@ def test_spz_signs_are_those_of_the_basis(rng):
     assert_allclose(sh_basis(turned, 3)[:, 1:], sh_basis(directions, 3)[:, 1:] * spz.SIGNS, atol=CLOSED_FORM)
 
 
-@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("level", [0, 2])
 @pytest.mark.parametrize("sh_degree", range(4))
 def test_spz_round_trip(level, sh_degree, rng):
     gaussians = population(200, sh_degree)
@@ -71,6 +71,17 @@ def test_spz_round_trip(level, sh_degree, rng):
     angle = rotation_error(gaussians.quats, back.quats).max()
     assert angle < (0.005 if level == 0 else 0.24)
     assert spz.encode(back, level) == content
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_spz_version_4_holds_what_version_3_does(sh_degree):
+    third, fourth = (spz.encode(population(50, sh_degree), level) for level in (0, 1))
+    assert fourth[:16] == b"NGSP" + bytes([4, 0, 0, 0, 50, 0, 0, 0, sh_degree, 12, 0, 6])
+    assert struct.unpack("<I", fourth[16:20]) == (32,)
+    assert struct.unpack("<QQ", fourth[32:48])[1] == 50 * 9
+    for value, other in zip(spz.decode(fourth, "fourth"), spz.decode(third, "third"), strict=True):
+        np.testing.assert_array_equal(value, other)
+    assert spz.SPZ.describe(fourth, "fourth")[0] == ("SPZ version", "4")
 
 
 def test_spz_of_another_program(shared_data):
