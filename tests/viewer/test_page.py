@@ -127,6 +127,7 @@ def picture(browser, path):
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")) / 255.0
 
 
+@pytest.mark.interop
 def test_a_browser_shows_what_we_render(tmp_path):
     program = find_browser()
     if program is None:
