@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
                 " compact format"
             )
         source.owner.save(out, source.model.gaussians, source.label)
-        lines = []
+        lines = ["  SuperSplat opens it, splat-transform converts it, and a page to send is convert MODEL NAME.html"]
     else:
         check_population(source.model.gaussians, format_, source.what)
         format_ = format_._replace(encode=partial(encode_as, format_, out, source.label))
