@@ -16,14 +16,16 @@ from compact import population, refusal, refused_line, rotation_error
 from data_tools.foreign_files.ksplat import write_ksplat
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.extensions.compression import compressed_ply, ksplat, levels8, sog, splat
+from minisplat_ref.extensions.compression import compressed_ply, glb, ksplat, levels8, sog, splat
 from minisplat_ref.extensions.extension import find_format
 from minisplat_ref.io import load_ply, save_ply
 from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Gaussians
 from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32
 
-COMPRESSED, KSPLAT, SOG, SPLAT = compressed_ply.COMPRESSED_PLY, ksplat.KSPLAT, sog.SOG, splat.SPLAT
+COMPRESSED, GLB, KSPLAT = compressed_ply.COMPRESSED_PLY, glb.GLB, ksplat.KSPLAT
+SOG, SPLAT = sog.SOG, splat.SPLAT
 OPACITY = 0.5 / 255 + ROUNDED_TO_FLOAT32
 COLOR = 0.5 / 255 / 0.28209479 + ROUNDED_TO_FLOAT32  # of a coefficient of degree 0 in 255ths of colour
 HALF = 2.0**-11  # relative error of a half float
@@ -306,10 +308,103 @@ def test_ksplat_refuses():
         KSPLAT.encode(mild(3), 0)
 
 
+# .glb
+
+
+def glb_parts(content):
+    n = struct.unpack("<I", content[12:16])[0]
+    return json.loads(content[20 : 20 + n]), content[28 + n :]
+
+
+def changed_glb(content, change):
+    """A file whose JSON has been changed in place."""
+    document, body = glb_parts(content)
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def test_glb_by_hand():
+    rest = np.arange(9, dtype=np.float32).reshape(1, 3, 3)
+    document, body = glb_parts(GLB.encode(one(quats=[[2.0, 0.0, 0.0, 0.0]], sh_rest=rest), 0))
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"] and primitive["mode"] == 0
+    assert primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+    }
+    assert list(primitive["attributes"])[-1] == "KHR_gaussian_splatting:SH_DEGREE_1_COEF_2"
+    assert struct.unpack("<3f", body[:12]) == (-1, 2, 0.5)  # x and y change sign
+    assert body[12:16] == bytes([128, 255, 0, 128])
+    assert struct.unpack("<4f", body[16:32]) == (0, 0, 0, 1)  # xyzw
+    assert struct.unpack("<4f", body[32:48]) == pytest.approx((1, 2, 0.5, 0.5))
+    assert struct.unpack("<9f", body[60:]) == (0, -1, -2, 3, 4, 5, -6, -7, -8)  # y and x are odd
+
+
+def test_glb_signs_are_those_of_the_basis(rng):
+    directions = rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = directions * [-1, -1, 1]
+    assert_allclose(sh_basis(turned, 3)[:, 1:], sh_basis(directions, 3)[:, 1:] * glb.SIGNS, atol=CLOSED_FORM)
+
+
+@pytest.mark.parametrize(("n", "sh_degree"), [(0, 0), (1, 0), (20, 1), (20, 2), (20, 3)])
+def test_glb_round_trip(n, sh_degree):
+    gaussians = mild(n, sh_degree)
+    back = GLB.decode(GLB.encode(gaussians, 0), "file")
+    for name in ("means", "sh_dc", "sh_rest"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(gaussians, name), err_msg=name)
+    assert_allclose(back.log_scales, gaussians.log_scales, atol=4 * ROUNDED_TO_FLOAT32)
+    assert_allclose(opacities(back), opacities(gaussians), atol=1e-6)
+    assert rotation_error(back.quats, gaussians.quats).max(initial=0) < 1e-6
+
+
+def test_glb_in_integers():
+    """Opacity as normalised bytes, interleaved with what does not matter."""
+
+    def change(document):
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        color = attributes["COLOR_0"]
+        document["bufferViews"][color]["byteStride"] = 4
+        document["accessors"].append(document["accessors"][color] | {"type": "SCALAR", "byteOffset": 3})
+        attributes["KHR_gaussian_splatting:OPACITY"] = len(document["accessors"]) - 1
+
+    gaussians = mild(20, 1)
+    back = GLB.decode(changed_glb(GLB.encode(gaussians, 0), change), "file")
+    assert_allclose(opacities(back), opacities(gaussians), atol=OPACITY)
+    assert np.abs(opacities(back) - opacities(gaussians)).max() > 1e-4
+
+
+def test_glb_refuses():
+    content = GLB.encode(mild(20, 1), 0)
+
+    def refused(change):
+        return refusal(GLB, changed_glb(content, change))
+
+    def primitive(document):
+        return document["meshes"][0]["primitives"][0]
+
+    assert "truncated" in refusal(GLB, content[:-1]) and "truncated" in refusal(GLB, content[:15])
+    assert "not a .glb" in refusal(GLB, b"glTF" + struct.pack("<II", 1, 20) + bytes(20))
+    assert "on a moved node" in refused(lambda d: d["nodes"][0].update(rotation=[0, 0, 1, 0]))
+    assert "0 primitives" in refused(lambda d: primitive(d).pop("extensions"))
+    assert "kernel disc" in refused(
+        lambda d: primitive(d)["extensions"]["KHR_gaussian_splatting"].update(kernel="disc")
+    )
+    assert "ends behind its bytes" in refused(lambda d: d["accessors"][0].update(count=10**12))
+    assert "different lengths" in refused(lambda d: d["accessors"][2].update(count=19))
+    assert "not those of degree" in refused(lambda d: primitive(d)["attributes"].popitem())
+    assert "POSITION cannot be read" in refused(lambda d: primitive(d)["attributes"].update(POSITION=99))
+    with pytest.raises(InputError, match="beyond float32"):
+        GLB.encode(one(log_scales=[[0.0, 0.0, -200.0]]), 0)
+
+
 # all of them
 
 
-@pytest.mark.parametrize("format_", [SPLAT, SOG, COMPRESSED], ids=lambda f: f.suffix)
+@pytest.mark.parametrize("format_", [SPLAT, SOG, COMPRESSED, GLB], ids=lambda f: f.suffix)
 def test_damage_is_refused_or_harmless(format_, rng):
     content = encoded(format_, mild(40, 1))
     for cut in rng.integers(0, len(content), 30):
@@ -332,10 +427,10 @@ def test_damage_is_refused_or_harmless(format_, rng):
 def test_the_command_line_knows_them(tmp_path, capfd):
     save_ply(tmp_path / "a.ply", mild(30, 1))
     (tmp_path / "b.ksplat").write_bytes(write_ksplat(mild(30, 1), 1))
-    for name in ("a.splat", "a.sog", "a.compressed.ply"):
+    for name in ("a.splat", "a.sog", "a.compressed.ply", "a.glb"):
         assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / name)]) == 0
         assert find_format(tmp_path / name) is not None
-    for name in ("a.splat", "a.sog", "a.compressed.ply", "b.ksplat"):
+    for name in ("a.splat", "a.sog", "a.compressed.ply", "a.glb", "b.ksplat"):
         capfd.readouterr()
         assert main(["info", str(tmp_path / name)]) == 0
         assert "30" in capfd.readouterr().out

@@ -16,16 +16,17 @@ from compact import population, rotation_error
 from data_tools.foreign_files.ksplat import write_ksplat
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.compression import compressed_ply, ksplat, sog, splat, spz
+from minisplat_ref.extensions.compression import compressed_ply, glb, ksplat, sog, splat, spz
 from minisplat_ref.io import load_ply, save_ply
 from minisplat_ref.io.lens import import_pycolmap
+from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.types import Gaussians
 from tolerances import ROUNDED_TO_FLOAT32, SPZ_ROTATION
 
 pytestmark = pytest.mark.interop
 
-COMPRESSED, KSPLAT, SOG = compressed_ply.COMPRESSED_PLY, ksplat.KSPLAT, sog.SOG
-SPLAT, SPZ = splat.SPLAT, spz.SPZ
+COMPRESSED, GLB, KSPLAT = compressed_ply.COMPRESSED_PLY, glb.GLB, ksplat.KSPLAT
+SOG, SPLAT, SPZ = sog.SOG, splat.SPLAT, spz.SPZ
 SECONDS = 120
 ROTATIONS = {".splat": 0.02, ".spz": SPZ_ROTATION}  # radians; it reads a byte b of a .splat as b / 127.5 - 1
 SAME_ROTATION = 1e-3  # the root of what three components leave, in float32
@@ -126,6 +127,16 @@ def test_splat_transform_reads_a_ksplat_as_we_do(level, sh_degree, splat_transfo
     path.write_bytes(write_ksplat(mild(83, sh_degree), level, n_sections=1))
     splat_transform(path, tmp_path / "theirs.ply")
     check_same(load_ply(tmp_path / "theirs.ply"), KSPLAT.decode(path.read_bytes(), path))
+
+
+def test_we_read_the_glb_that_splat_transform_writes(splat_transform, tmp_path):
+    """It does not read any, so it is no judge of ours. It turns a Gaussian about its own axis, too, by 180 degrees."""
+    save_ply(tmp_path / "from.ply", mild())
+    splat_transform(tmp_path / "from.ply", tmp_path / "theirs.glb")
+    theirs = GLB.decode((tmp_path / "theirs.glb").read_bytes(), "theirs.glb")
+    check_same(theirs, mild(), rotation=np.inf)
+    shapes = [covariances(g.quats.astype(float), np.exp(g.log_scales.astype(float))) for g in (theirs, mild())]
+    assert_allclose(*shapes, atol=1e-6)
 
 
 def of_gsply(data):

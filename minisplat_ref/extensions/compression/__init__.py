@@ -14,7 +14,8 @@ are stored together, and zstandard packs them. There are 13 levels; level 0 keep
 
 The others are for other programs: ``.spz`` (:mod:`minisplat_ref.extensions.compression.spz`), Niantic's, versions 2 to
 4; ``.splat`` (:mod:`.splat`), of the first viewers in the browser; ``.sog`` (:mod:`.sog`) and ``.compressed.ply``
-(:mod:`.compressed_ply`), of SuperSplat and PlayCanvas; and ``.ksplat`` (:mod:`.ksplat`), which is only read.
+(:mod:`.compressed_ply`), of SuperSplat and PlayCanvas; ``.glb`` (:mod:`.glb`), glTF with its extension for Gaussians;
+and ``.ksplat`` (:mod:`.ksplat`), which is only read.
 
     minisplat-ref convert runs/fox fox.msz --max-drop 0.1
     minisplat-ref convert fox.msz fox.ply
@@ -30,6 +31,7 @@ vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.m
 """
 
 from minisplat_ref.extensions.compression.compressed_ply import COMPRESSED_PLY
+from minisplat_ref.extensions.compression.glb import GLB
 from minisplat_ref.extensions.compression.ksplat import KSPLAT
 from minisplat_ref.extensions.compression.msz import MSZ
 from minisplat_ref.extensions.compression.sog import SOG
@@ -45,5 +47,7 @@ RATE_DISTORTION = declare(
     *trainings(1000, "mini-splatting2"),
     argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program"),
 )
-EXTENSION = Extension("compression", formats=(MSZ, SPZ, SPLAT, SOG, COMPRESSED_PLY, KSPLAT), studies=(RATE_DISTORTION,))
+EXTENSION = Extension(
+    "compression", formats=(MSZ, SPZ, SPLAT, SOG, COMPRESSED_PLY, GLB, KSPLAT), studies=(RATE_DISTORTION,)
+)
 """The formats of this project and of other programs, and a study."""
