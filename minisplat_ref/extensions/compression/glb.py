@@ -51,6 +51,7 @@ DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 ARRAY_BUFFER, POINTS = 34962, 0
 JSON_MAX = 1 << 20  # bytes
 OPACITY_END = 1e-6  # opacities 0 and 1 have no logit, and are read as so far from the end
+SCALE_MIN = 1e-10  # world units, as which a scale of 0, which the extension allows, is read
 _AXES = np.array([-1, -1, 1], np.float32)
 # Under (x, y, z) -> (-x, -y, z), by whether the polynomials are odd in x and y together; the order is that of SPZ's.
 SIGNS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
@@ -150,7 +151,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     n = len(means)
     if {len(array) for array in (quats, scales, opacities, sh_dc, *rest)} != {n}:
         raise InputError(f"{source}: damaged, its attributes have different lengths; {WAY_OUT}")
-    bad = np.flatnonzero(~((scales > 0).all(axis=1) & (opacities[:, 0] >= 0) & (opacities[:, 0] <= 1)))
+    bad = np.flatnonzero(~((scales >= 0).all(axis=1) & (opacities[:, 0] >= 0) & (opacities[:, 0] <= 1)))
     if bad.size:
         values = f"the scales {scales[bad[0]].tolist()} and the opacity {opacities[bad[0], 0]:g}"
         raise InputError(f"{source}: row {bad[0]} has {values}; {WAY_OUT}")
@@ -160,7 +161,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     gaussians = Gaussians(
         means=means * _AXES,
         quats=np.roll(quats * np.array([-1, -1, 1, 1]), 1, axis=1),
-        log_scales=np.log(scales),
+        log_scales=np.log(np.maximum(scales, SCALE_MIN)),
         opacity_logits=np.log(within / (1.0 - within)),
         sh_dc=sh_dc,
         sh_rest=sh_rest,
