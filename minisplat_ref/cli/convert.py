@@ -40,7 +40,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "convert",
-        help="write a model as a PLY, in a compact format or as a web page",
+        help="write a model as a PLY, compact file or web page",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
