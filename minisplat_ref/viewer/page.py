@@ -11,7 +11,7 @@ colour     3 x float16, coefficients of degree 0
 harmonics  3 (K - 1) x int8 in steps of one 127th of the largest absolute coefficient
 ========== ========================================================================
 
-We write a viewer of under 300 lines because the bundled ones weigh 3.3 MB (SuperSplat's) and 2.7 MB besides three.js (Spark).
+We wrote a viewer of our own, as the bundled ones weigh 3.3 MB (SuperSplat's) and 2.7 MB besides three.js (Spark).
 It draws what the profile GSPLAT_MAIN defines: opacities, colours, low-pass and bounds are those of ``render``, blended
 in half floats. Left out are early termination, lenses, and whatever an extension adds to the six fields of 3DGS.
 """
