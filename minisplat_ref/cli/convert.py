@@ -1,4 +1,4 @@
-"""``convert``: a model from any file into a PLY or a compact format."""
+"""``convert``: a model from any file into a PLY, a compact format or a page to send."""
 
 import argparse
 import math
@@ -18,7 +18,8 @@ DESCRIPTION = """\
 Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
 compact file. The suffix of OUT says what is written: .ply is the 3DGS layout
 with every float; compact formats and their levels of precision, of which 0 is
-the finest, come with extensions (see minisplat-ref extensions compression).
+the finest, come with extensions (see minisplat-ref extensions compression);
+.html is one page to send, which shows the scene in a browser, without network.
 
   --max-bytes B   the finest level whose file has at most B bytes
   --max-drop dB   the coarsest level that loses at most so much PSNR, measured
@@ -31,6 +32,7 @@ examples:
   minisplat-ref convert runs/fox fox.ply
   minisplat-ref convert runs/fox fox.msz --max-drop 0.1
   minisplat-ref convert fox.msz fox.spz
+  minisplat-ref convert runs/fox fox.html
 """
 
 
@@ -38,7 +40,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "convert",
-        help="write a model as a PLY or in a compact format",
+        help="write a model as a PLY, compact file or web page",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
@@ -65,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.runs.conversion import check_population, choose_format, encode_as, open_source
 
     out: Path = args.output
+    if out.suffix.lower() == ".html":
+        return _write_page(args)
     format_ = choose_format(out)
     if args.max_drop is None and (args.scene is not None or args.downscale is not None):
         raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
@@ -77,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
                 " compact format"
             )
         source.owner.save(out, source.model.gaussians, source.label)
-        lines = []
+        lines = ["  SuperSplat opens it, splat-transform converts it, and a page to send is convert MODEL NAME.html"]
     else:
         check_population(source.model.gaussians, format_, source.what)
         format_ = format_._replace(encode=partial(encode_as, format_, out, source.label))
@@ -90,6 +94,37 @@ def run(args: argparse.Namespace) -> int:
     own = source.owner.representation.rates.of if source.owner.saves_plain else {}  # its files need none of these
     if names := ", ".join(name for name in source.model.shared if name not in own):
         print(f"minisplat-ref: a {out.suffix} does not hold {names}, which belong to no row", file=sys.stderr)
+    return 0
+
+
+def _write_page(args: argparse.Namespace) -> int:
+    """Write the model as a page that shows it, and say how to open it."""
+    from minisplat_ref.io.formats import write_content
+    from minisplat_ref.rendering import SPLATTING
+    from minisplat_ref.runs.source import open_source
+    from minisplat_ref.types import Gaussians
+    from minisplat_ref.viewer.page import write_page
+
+    out, path = args.output, args.input
+    options = ("max_bytes", "max_drop", "level", "scene", "downscale")
+    if given := [name for name in options if getattr(args, name) is not None]:
+        raise InputError(f"a page has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out")
+    source = open_source(path, args.extension)
+    trained = source.trained
+    population = trained.model.gaussians
+    if further := [name for name in population._fields if name not in Gaussians._fields]:
+        raise InputError(
+            f"{path} has {', '.join(further)}, which a page does not show: look at it with minisplat-ref view {path}"
+        )
+    name = path.resolve().name
+    cameras = [view for view in source.cameras if view.split != "test"] or source.cameras
+    write_content(out, write_page(name, population, cameras, trained.background).encode())
+    print(
+        f"{len(population.means):,} Gaussians of {name} in {out}, {out.stat().st_size:,} bytes: open it in any browser"
+    )
+    parts = [*trained.model.shared, *([] if trained.renderer.name == SPLATTING.name else [trained.renderer.name])]
+    if parts:
+        print(f"minisplat-ref: the page shows plain 3DGS, without {', '.join(parts)}", file=sys.stderr)
     return 0
 
 

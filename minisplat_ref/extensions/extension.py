@@ -211,13 +211,13 @@ def find_format(path: str | Path) -> Format | None:
     InputError
         Two extensions have a format of that suffix.
     """
-    suffix = Path(path).suffix.lower()
+    suffix = "".join(Path(path).suffixes[-2:]).lower()
     if suffix in ("", ".ply"):  # which need no extension to be loaded
         return None
-    found = [(format_, owner) for owner, format_ in all_formats() if format_.suffix == suffix]
+    found = [(format_, owner) for owner, format_ in all_formats() if suffix.endswith(format_.suffix)]
     if len(found) > 1:
         owners = " and ".join(owner for _, owner in found)
-        raise InputError(f"{suffix} is a format of the extensions {owners}: rename one")
+        raise InputError(f"{found[0][0].suffix} is a format of the extensions {owners}: rename one")
     return found[0][0] if found else None
 
 

@@ -315,7 +315,7 @@ def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[st
 def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
     """Return what to do with a PLY that does not contain Gaussians."""
     if "packed_position" in columns:
-        return "it is a compressed splat: export it as a plain PLY"
+        return "it is SuperSplat's: let its name end in .compressed.ply"
     n_faces = n_rows_of(path, "face")
     if n_faces:
         return f"it is a mesh of {n_faces:,} faces, which is not rendered: give a trained point_cloud.ply"

@@ -81,7 +81,7 @@ def run_all(commands, capsys):
 
 def test_the_chain_of_the_readme_and_what_its_reports_recommend(capsys):
     chain = readme_chain()
-    assert [words[0] for words in chain] == ["sfm", "train", "render", "eval", "info", "simplify", "mesh"]
+    assert [words[0] for words in chain] == ["sfm", "train", "render", "convert", "eval", "info", "simplify", "mesh"]
     (photographs, training, *rest), before = chain, set(Path().rglob("report.html"))
     assert photographs == ["sfm", "PHOTOS", "--out", "SCENE"], "finds the cameras: the scene is there already"
     assert "--recipe" not in training

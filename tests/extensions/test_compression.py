@@ -306,7 +306,14 @@ def test_study_of_a_ply(run, tmp_path, capsys):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     drops = {point["name"]: point["drop"] for point in result["runs"][0]}
     sizes = {point["name"]: point["n_bytes"] for point in result["runs"][0]}
-    assert list(drops) == ["ply", "sog", "spz version 3", "spz version 2", *(f"msz {level}" for level in LEVELS)]
+    assert list(drops) == [
+        "ply",
+        "sog",
+        "spz version 3",
+        "spz version 4",
+        "spz version 2",
+        *(f"msz {level}" for level in LEVELS),
+    ]
     assert drops["ply"] == drops["sog"] == drops["msz 0"] == 0.0
     assert abs(drops["msz 1"]) < 0.2 * abs(drops["msz 12"])
     assert sizes["ply"] == sizes["sog"] == (run / "point_cloud.ply").stat().st_size

@@ -1,4 +1,4 @@
-"""``.spz``: Niantic's format, versions 2 to 4 read, 2 and 3 written.
+"""``.spz``: Niantic's format, versions 2 to 4.
 
 A file is a gzip stream, in version 4 a plain header and a zstandard frame for each part (:mod:`.spz_streams`). It holds
 a header of 16 bytes (magic, version, number N, degree of the spherical harmonics, fractional bits, flags) and then,
@@ -22,7 +22,8 @@ of their size. What neither would hold is refused.
 down, z forward). Niantic's library converts one to the other when its caller asks for it; we always do, in agreement
 with a sample of three Gaussians in both formats. y and z change sign, which is a rotation by 180 degrees around x. So
 the y and z of a quaternion change sign, and so do the harmonics that are odd in y and z together, which :data:`SIGNS`
-derives from their polynomials. PlayCanvas' splat-transform reads what we write in the same way.
+derives from their polynomials. Programs disagree: splat-transform 2.7.1 reads what we write in the same way, 3.7.0 does
+not convert, and shows it turned by 180 degrees around x.
 
 Opacities 0 and 1 have no logit. They are read as a quarter of a quantisation level away from the end.
 
@@ -48,8 +49,9 @@ from minisplat_ref.io.formats import Format
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
-MAGIC = 0x5053474E  # "NGSP"
-VERSIONS = (3, 2)  # as levels: the finest first
+MAGIC = spz_streams.MAGIC
+VERSIONS = (3, 4, 2)  # as levels: the finest first; 3 and 4 hold the same numbers, and every reader of 4 reads 3
+GZIPPED = (2, 3)
 FRACTIONAL_BITS, FRACTIONAL_BITS_MAX = 12, 23
 STEP_MAX = 0.1  # of the median of the largest scales; the step of 12 bits is about 0.02 of it in a usual scene
 LOG_SCALE_MIN = -10.0
@@ -89,12 +91,12 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     gaussians : Gaussians
         In the world frame of a PLY.
     level : int
-        0 writes version 3, 1 version 2.
+        0 writes version 3, 1 version 4, 2 version 2.
 
     Raises
     ------
     InputError
-        A value is not finite, or a centre is out of reach.
+        A value is not finite, a centre is out of reach, or version 4 is asked for and zstandard is not installed.
     """
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
@@ -110,10 +112,12 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         _to_bytes(255.0 * opacities),
         _to_bytes(255.0 * (COLOR_SCALE * gaussians.sh_dc.astype(np.float64) + 0.5)),
         _to_bytes(16.0 * (gaussians.log_scales.astype(np.float64) + 10.0)),
-        _to_smallest_three(quats) if version == 3 else _to_vector(quats),
+        _to_vector(quats) if version == 2 else _to_smallest_three(quats),
         _to_buckets(sh_rest),
     )
     sh_degree = math.isqrt(n_rest + 1) - 1
+    if version == spz_streams.VERSION:
+        return spz_streams.pack(n, sh_degree, fractional_bits, (part.tobytes() for part in parts))
     header = HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0)
     compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
     return compressor.compress(header + b"".join(part.tobytes() for part in parts)) + compressor.flush()
@@ -265,7 +269,7 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
     if len(head) < HEADER.size or HEADER.unpack(head)[0] != MAGIC:
         raise InputError(f"{source}: not an SPZ file, its content does not begin with NGSP; {WAY_OUT}")
     _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
-    if version not in VERSIONS:
+    if version not in GZIPPED:
         raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2, 3 or 4")
     header = _Header(version, n, degree, fractional_bits)
     _check_header(header, source)
@@ -320,7 +324,7 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
 
 SPZ = Format(
     suffix=".spz",
-    summary="Niantic's, versions 3 and 2 (4 is read)",
+    summary="Niantic's, versions 3, 4 and 2",
     levels=tuple(f"version {version}" for version in VERSIONS),
     default_level=0,
     encode=encode,

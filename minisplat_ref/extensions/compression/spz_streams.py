@@ -16,13 +16,14 @@ rotations, harmonics. splat-transform and Niantic's library write this version b
 """
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.packing.container import unpack_frame
+from minisplat_ref.mechanisms.packing.container import pack_frame, unpack_frame
 
+MAGIC = 0x5053474E  # "NGSP"
 VERSION = 4
 HEADER = struct.Struct("<IIIBBBBI12x")
 ENTRY = struct.Struct("<QQ")
@@ -39,6 +40,28 @@ class Streams(NamedTuple):
     """Packed, in the order of the file."""
     sizes: tuple[int, ...]
     """Bytes of each, unpacked, as the table says."""
+
+
+def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes]) -> bytes:
+    """Return the content of a file, without records of vendors.
+
+    Parameters
+    ----------
+    n, sh_degree, fractional_bits : int
+        Of the header.
+    parts : iterable of bytes
+        The six streams, in the order of the file.
+
+    Raises
+    ------
+    InputError
+        zstandard is not installed.
+    """
+    parts = list(parts)
+    frames = [pack_frame(part) for part in parts]
+    header = HEADER.pack(MAGIC, VERSION, n, sh_degree, fractional_bits, 0, len(parts), HEADER.size)
+    table = [ENTRY.pack(len(frame), len(part)) for frame, part in zip(frames, parts, strict=True)]
+    return b"".join([header, *table, *frames])
 
 
 def parse(content: bytes, source: str | Path) -> Streams:

@@ -94,6 +94,17 @@ def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, 
     return b"".join([prefix, text, *frames.values()])
 
 
+def pack_frame(raw: bytes) -> bytes:
+    """Return bytes as a zstandard frame that says how many they are, for files with a layout of their own.
+
+    Raises
+    ------
+    InputError
+        zstandard is not installed.
+    """
+    return bytes(_zstandard().ZstdCompressor(level=LEVEL).compress(raw))
+
+
 def parse(container: Container, content: bytes, source: str | Path) -> Packed:
     """Check magic, version and sizes of a file, and return its header and its frames, still packed.
 

@@ -1,0 +1,106 @@
+"""``.splat``: 32 bytes for each Gaussian, without a header, as antimatter15's viewer introduced it.
+
+======== =====================================================
+centre   3 x float32
+scales   3 x float32, not their logarithms
+colour   3 x uint8 in 255ths: ``0.5 + SH_C0 c``, clipped
+opacity  uint8 in 255ths
+rotation 4 x uint8, wxyz: ``128 q + 128``, clipped
+======== =====================================================
+
+The frame is that of the PLY. Harmonics of degree 1 and above are left out, with a warning. The order of the Gaussians
+is kept; other writers put those of large volume and opacity first, for viewers that show a file while it comes.
+"""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from minisplat_ref.errors import InputError, InputWarning
+from minisplat_ref.extensions.compression.levels8 import (
+    WAY_OUT,
+    check_float32,
+    color_bytes,
+    finish,
+    logits_of,
+    opacity_bytes,
+    sh_dc_of,
+)
+from minisplat_ref.io.formats import Format
+from minisplat_ref.types import Gaussians
+
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+
+def encode(gaussians: Gaussians, level: int) -> bytes:
+    """Return the content of a file; it has one level.
+
+    Raises
+    ------
+    InputError
+        A value is not finite, or a scale is beyond float32.
+    """
+    check_float32(gaussians)
+    rows = np.empty(len(gaussians.means), ROW)
+    with np.errstate(over="ignore"):
+        rows["scales"] = np.exp(gaussians.log_scales.astype(np.float64))
+    bad = np.flatnonzero(~np.isfinite(rows["scales"]).all(axis=1) | (rows["scales"] == 0).any(axis=1))
+    if bad.size:
+        value = gaussians.log_scales[bad[0]].tolist()
+        raise InputError(f"the scales of row {bad[0]}, e^{value}, are beyond float32: remove its Gaussian")
+    if gaussians.sh_rest.size:
+        warnings.warn(".splat holds no harmonics above degree 0: they are left out", InputWarning, stacklevel=2)
+    rows["means"] = gaussians.means
+    rows["rgba"][:, :3] = color_bytes(gaussians.sh_dc)
+    rows["rgba"][:, 3] = opacity_bytes(gaussians.opacity_logits)
+    unit = gaussians.quats / np.linalg.norm(gaussians.quats.astype(np.float64), axis=1, keepdims=True)
+    rows["quats"] = np.clip(np.floor(128.0 * unit + 128.5), 0, 255)
+    return rows.tobytes()
+
+
+def decode(content: bytes, source: str | Path) -> Gaussians:
+    """Return the Gaussians of a file, float32, of degree 0.
+
+    Raises
+    ------
+    InputError
+        The file is no sequence of rows, or a value makes no sense.
+    """
+    if len(content) % ROW.itemsize:
+        raise InputError(f"{source}: {len(content):,} bytes are no rows of {ROW.itemsize}: {WAY_OUT}")
+    rows = np.frombuffer(content, ROW)
+    bad = np.flatnonzero(~(rows["scales"] > 0).all(axis=1))
+    if bad.size:
+        raise InputError(f"{source}: row {bad[0]} has the scales {rows['scales'][bad[0]].tolist()}; {WAY_OUT}")
+    with np.errstate(invalid="ignore"):
+        gaussians = Gaussians(
+            means=rows["means"],
+            quats=(rows["quats"].astype(np.float64) - 128.0) / 128.0,
+            log_scales=np.log(rows["scales"].astype(np.float64)),
+            opacity_logits=logits_of(rows["rgba"][:, 3]),
+            sh_dc=sh_dc_of(rows["rgba"][:, :3]),
+            sh_rest=np.zeros((len(rows), 0, 3)),
+        )
+    return finish(source, gaussians)
+
+
+def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
+    """Return how precise a file is, as pairs of name and text."""
+    return [
+        ("centres, scales", "float32"),
+        ("rotations", f"each component within {0.5 / 128:.2g}"),
+        ("colours, opacities", f"within {0.5 / 255:.2g}; no harmonics above degree 0"),
+    ]
+
+
+SPLAT = Format(
+    suffix=".splat",
+    summary="32 bytes each, degree 0",
+    levels=("8 bits",),
+    default_level=0,
+    encode=encode,
+    decode=decode,
+    describe=describe,
+)
+"""What the first viewers in the browser read."""
