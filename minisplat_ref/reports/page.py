@@ -19,6 +19,7 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-s
 BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
 GOOD = {"passed", "agrees"}
 LONG = 44  # characters of a cell that may break into lines
+N_COLUMNS = 4  # of a table that fits on a phone; in one with more, or with a long cell, cells stand below each other
 TALL = 60  # rows of a table that scrolls in the page instead of making it long
 PNG_PIXELS = 1 << 17  # of larger images a PNG would make the page heavy
 JPEG_QUALITY = 92
@@ -66,6 +67,12 @@ def section(heading: str, *parts: str) -> str:
     return "\n".join([f"<h2>{escape(heading)}</h2>", *parts])
 
 
+def folded(heading: str, *parts: str) -> str:
+    """Return parts of a page under a heading that has to be opened."""
+    newline = "\n"
+    return f"<details><summary><h2>{escape(heading)}</h2></summary>\n{newline.join(parts)}\n</details>"
+
+
 def paragraph(text: str) -> str:
     """Return sentences."""
     return f"<p>{escape(text)}</p>"
@@ -90,10 +97,16 @@ def cards(figures: Iterable[tuple[str, str]]) -> str:
 
 
 def table(rows: Iterable[Sequence[str]], heading: Sequence[str] = ()) -> str:
-    """Return a panel with a table whose first column names the rows; a wide one scrolls under that column."""
+    """Return a panel with a table whose first column names the rows; a wide one scrolls under that column.
+
+    On a phone the cells of a wide row stand below each other, each behind its heading.
+    """
+    rows = [tuple(row) for row in rows]
     head = f"<thead><tr>{''.join(map(_heading_cell, heading))}</tr></thead>" if heading else ""
-    lines = [f"<tr>{_name_cell(name)}{''.join(map(_cell, cells))}</tr>" for name, *cells in rows]
-    kind, tall = "data" if heading else "facts", " tall" * (len(lines) > TALL)
+    is_wide = len(heading) > N_COLUMNS or (bool(heading) and any(len(cell) > LONG for row in rows for cell in row))
+    labels = heading[1:] if is_wide else [""] * max((len(row) for row in rows), default=0)
+    lines = [f"<tr>{_name_cell(name)}{''.join(map(_cell, cells, labels))}</tr>" for name, *cells in rows]
+    kind, tall = "data wide" if is_wide else "data" if heading else "facts", " tall" * (len(lines) > TALL)
     content = f'<table class="{kind}">{head}<tbody>{"".join(lines)}</tbody></table>'
     return f'<div class="panel scroll{tall}" tabindex="0">{content}</div>'
 
@@ -106,9 +119,10 @@ def _name_cell(text: str) -> str:
     return f'<th scope="row">{escape(text).replace("_", "_<wbr>")}</th>'
 
 
-def _cell(text: str) -> str:
+def _cell(text: str, label: str) -> str:
     kind = "bad" if text in BAD else "good" if text in GOOD else "long" if len(text) > LONG else ""
-    return f'<td class="{kind}">{escape(text)}</td>' if kind else f"<td>{escape(text)}</td>"
+    marks = [*([f'class="{kind}"'] if kind else []), *([f'data-label="{escape(label)}"'] if label else [])]
+    return f"<td{''.join(f' {mark}' for mark in marks)}>{escape(text)}</td>"
 
 
 def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:

@@ -28,6 +28,7 @@ body { margin: 0; background: var(--page); color: var(--ink); font: 16px/1.55 sy
 main { max-width: 1080px; margin: 0 auto; padding: 40px 24px 64px; overflow-wrap: anywhere }
 h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; font-weight: 650 }
 h2 { font-size: 20px; margin: 48px 0 4px; font-weight: 600 }
+summary h2 { display: inline-block; cursor: pointer }
 p, ul { margin: 4px 0 16px; color: var(--soft); max-width: 74ch }
 ul { padding-left: 20px; font-size: 15px }
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 24px 0 }
@@ -89,6 +90,14 @@ code, pre { font: 14px/1.5 ui-monospace, "DejaVu Sans Mono", monospace }
   td:first-child, th:first-child { padding-left: 12px }
   .data tbody th { max-width: 38vw; min-width: 0 }
   .facts tbody th { width: 30% }
+  pre { white-space: pre-wrap }
+  .wide thead { display: none }
+  .wide, .wide tbody, .wide tr, .wide th, .wide td { display: block }
+  .wide tr { padding: 8px 12px; border-bottom: 1px solid var(--rule) }
+  .data.wide tbody th { max-width: none; font-weight: 600; position: static }
+  .data.wide td, .data.wide th { border: 0; padding: 1px 0; white-space: normal; min-width: 0 }
+  .wide td:empty { display: none }
+  .wide td::before { content: attr(data-label) ": "; color: var(--faint) }
 }
 @media print { .panel, .card { break-inside: avoid } }
 """

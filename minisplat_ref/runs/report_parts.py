@@ -38,7 +38,9 @@ def training_curves(log: Records) -> list[str]:
 def curve(records: Records, key: str, title: str, color: str) -> str:
     """Return one field of the records over the iterations, as SVG."""
     with plot(title, "iterations") as (figure, axes):
-        axes.plot([record["step"] for record in records], [record[key] for record in records], color=color, lw=1.8)
+        marker = "o" if len(records) == 1 else None  # a line of one point shows nothing
+        steps, values = ([record[name] for record in records] for name in ("step", key))
+        axes.plot(steps, values, color=color, lw=1.8, marker=marker)
     return to_svg(figure)
 
 

@@ -11,7 +11,7 @@ from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.names import file_names
 from minisplat_ref.reports.commands import command
 from minisplat_ref.reports.images import fit_image, split_images
-from minisplat_ref.reports.page import cards, code, curves, page, paragraph, section, table
+from minisplat_ref.reports.page import cards, code, curves, folded, page, paragraph, section, table
 from minisplat_ref.reports.palette import PURPLE
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.decisions_report import decisions_section
@@ -151,7 +151,7 @@ def _fired(folder: Path, settings: Settings, n_iterations: int) -> str:
     published = count_published_times(recipe)
     runs = [read_mechanisms(folder / run_folder.EVENTS, published)]
     fired = Fired(settings.recipe, n_iterations, recipe.iterations, published, runs)
-    return section("What fired, and when", paragraph(FIRED_TEXT), *fired_tables(fired))
+    return folded("What fired, and when", paragraph(FIRED_TEXT), *fired_tables(fired))
 
 
 def _settings(folder: Path, settings: Settings, metrics: dict[str, Any], scene: Scene) -> list[tuple[str, str]]:

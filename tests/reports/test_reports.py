@@ -98,8 +98,19 @@ def test_without_script_a_slider_is_two_images(specimen, browser):
     browser.send("Emulation.setScriptExecutionDisabled", value=False)
 
 
-def test_wide_tables_scroll_under_the_names_of_their_rows(specimen, browser):
+def test_on_a_phone_the_cells_of_a_wide_table_stand_below_each_other(specimen, browser):
     browser.open(specimen, width=390)
+    table_ = "document.querySelector('.wide')"
+    assert browser.run(f"{table_}.parentElement.scrollWidth <= {table_}.parentElement.clientWidth")
+    tops = f"[...{table_}.querySelector('tbody tr').children].map(cell => cell.getBoundingClientRect().top)"
+    found = browser.run(tops)
+    assert found == sorted(set(found)) and len(found) > 4
+    heading = browser.run(f"{table_}.querySelectorAll('thead th')[1].textContent")
+    assert heading in browser.run(f"getComputedStyle({table_}.querySelector('td'), '::before').content")
+
+
+def test_wide_tables_scroll_under_the_names_of_their_rows(specimen, browser):
+    browser.open(specimen, width=720)
     table_ = "document.querySelectorAll('.data')[0]"
     left = f"{table_}.querySelector('tbody th').getBoundingClientRect().left"
     before = browser.run(left)
