@@ -182,7 +182,7 @@ def _state_of_run(folder: Path, iterations: int) -> str:
     if step < iterations and not is_finished(folder, iterations):
         return f"incomplete, {step:,} of {iterations:,} iterations are saved: {going_on}"
     return (
-        "complete"
+        f"complete after {step:,} iterations"
         if is_finished(folder, iterations) or is_finished(folder, step)
         else f"trained, but not measured: {going_on}"
     )

@@ -301,7 +301,7 @@ def test_ctrl_c_while_views_are_measured_says_that_all_is_saved(original, finish
 
 def test_info_says_whether_a_run_has_ended(finished, original, tmp_path, capsys):
     assert main(["info", str(finished)]) == 0
-    assert re.search(r"^state +complete$", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(r"^state +complete after 20 iterations$", capsys.readouterr().out, re.MULTILINE)
     folder = stopped_run(original, tmp_path / "run")
     assert main(["info", str(folder)]) == 0
     expected = f"incomplete, 12 of 20 iterations are saved: minisplat-ref train --resume {folder}"
