@@ -17,7 +17,8 @@ from minisplat_ref.types import Ints
 
 EPILOG = """\
 example:
-  minisplat-ref segment render labelled.ply --cameras runs/fox/cameras.json --out labels"""
+  minisplat-ref segment render labelled.ply --cameras runs/fox/cameras.json \\
+    --out labels"""
 
 
 def add_parser(commands: Any) -> None:
