@@ -164,6 +164,11 @@ ORDER = (
                 (24,),
                 "small networks trained with a scene: opacities that depend on the view",
             ),
+            Step(
+                ("mechanisms/features/", "extensions/style/"),
+                (),
+                "features of images; a scene in the style of an image",
+            ),
             Step(("extensions/segment/",), (), "labels of Gaussians from masks of photographs, by a vote"),
             Step(("extensions/satellite/",), (), "affine cameras of satellites, the sun's shadows, surface models"),
             Step(

@@ -248,7 +248,12 @@ def train_with_progress(scene: Scene, recipe: "Recipe", seed: int, **arguments: 
 
 
 def fine_tune(
-    population: Any, scene: Scene, recipe: "Recipe", rng: np.random.Generator | int, on_step: Any = None
+    population: Any,
+    scene: Scene,
+    recipe: "Recipe",
+    rng: np.random.Generator | int,
+    on_step: Any = None,
+    **arguments: Any,
 ) -> Any:
     """Return a population after a training that begins with it; the given one is not changed.
 
@@ -262,6 +267,8 @@ def fine_tune(
         Draws what events draw, and the order of views; or its seed.
     on_step : callable, optional
         Called after each iteration.
+    **arguments
+        Others of :func:`~minisplat_ref.training.loop.train`.
     """
     from minisplat_ref.training.adam import zero_moments
     from minisplat_ref.training.loop import train
@@ -270,7 +277,7 @@ def fine_tune(
     copy = type(population)(*(np.ascontiguousarray(field).copy() for field in population))
     generator = np.random.default_rng(rng) if isinstance(rng, int) else rng
     state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=generator, stats={})
-    return train(scene, recipe, seed=0, state=state, on_step=on_step).gaussians
+    return train(scene, recipe, seed=0, state=state, on_step=on_step, **arguments).gaussians
 
 
 def without_events(recipe: "Recipe") -> "Recipe":
