@@ -103,6 +103,25 @@ def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floa
     return np.stack(np.broadcast_arrays(*slopes, 1.0), axis=-1)
 
 
+def points_at(depth: Floats, camera: Camera) -> Floats:
+    """Return the points that the pixels of a depth map show, ``x_world = R^T (z r - t)``, row by row.
+
+    Parameters
+    ----------
+    depth : ndarray of shape (H, W)
+        Camera z at the centres of the pixels, world units; 0 where a pixel shows nothing.
+    camera : Camera
+
+    Returns
+    -------
+    ndarray of shape (P, 3)
+        World frame.
+    """
+    y, x = np.nonzero(depth)
+    in_camera = depth[y, x][:, None] * pinhole_rays(x + 0.5, y + 0.5, camera)
+    return np.asarray((in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R)
+
+
 def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floats) -> Floats:
     """Return the Jacobians of :func:`pinhole`, EWA splatting equation (29), with x/z and y/z clamped to [low, high].
 

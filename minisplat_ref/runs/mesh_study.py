@@ -20,7 +20,7 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.viewpoints import scene_viewpoints
 from minisplat_ref.mechanisms.meshes.distances import OrientedPoints, compare_surfaces, sample_surface
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.reference.pinhole import points_at
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import SERIES
 from minisplat_ref.runs.depth_maps import DepthKind
@@ -63,10 +63,8 @@ def true_surface(made: SyntheticScene) -> OrientedPoints:
     normals = np.concatenate([made.train_normals, made.test_normals])
     points, directions = [], []
     for view, depth, normal in zip(views, depths, normals, strict=True):
-        camera, (y, x) = view.camera, np.nonzero(depth)
-        in_camera = depth[y, x][:, None] * pinhole_rays(x + 0.5, y + 0.5, camera)
-        points.append((in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R)
-        directions.append(normal[y, x])
+        points.append(points_at(depth, view.camera))
+        directions.append(normal[depth != 0])
     every, rng = np.concatenate(points), np.random.default_rng(0)
     chosen = rng.choice(len(every), min(N_POINTS, len(every)), replace=False)
     return OrientedPoints(every[chosen], np.concatenate(directions)[chosen])

@@ -12,6 +12,8 @@ from minisplat_ref.reference.pinhole import (
     pinhole_jacobians_vjp,
     pinhole_rays,
     pinhole_vjp,
+    points_at,
+    project_into_image,
     slope_limits,
 )
 from minisplat_ref.rendering import SPLATTING, Request
@@ -450,3 +452,16 @@ def test_dividing_by_powers_of_two_changes_no_bit(exponent, rng):
         assert_array_equal(factor * getattr(v_found, name), getattr(v_expected, name), err_msg=name)
     for name in ("quats", "opacities"):
         assert_array_equal(getattr(v_found, name), getattr(v_expected, name), err_msg=name)
+
+
+def test_points_of_depths_are_seen_where_they_came_from():
+    """The forward map, which shares no line, returns pixels and depths; a pixel without a depth has no point."""
+    camera = turned_camera()
+    depth = 2 + np.random.default_rng(0).uniform(size=(camera.height, camera.width))
+    depth[3, 5] = 0
+    points = points_at(depth, camera)
+    rows, xy, z = project_into_image(points, camera)
+    y, x = np.nonzero(depth)
+    assert len(rows) == len(points) == camera.height * camera.width - 1
+    assert_allclose(xy, np.column_stack([x, y]) + 0.5, atol=1e-9)  # pixels; 1e-14 of focal lengths and rotations
+    assert_allclose(z, depth[depth != 0], rtol=CLOSED_FORM)

@@ -38,6 +38,7 @@ from minisplat_ref.extensions.compression.levels8 import (
     finish,
     opacity_bytes,
     refuse_size,
+    scales_of,
 )
 from minisplat_ref.io.formats import Format
 from minisplat_ref.types import Floats, Gaussians
@@ -73,12 +74,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         A value is not finite, or a scale is beyond float32.
     """
     check_float32(gaussians)
-    with np.errstate(over="ignore"):
-        scales = np.exp(gaussians.log_scales.astype(np.float64)).astype("<f4")
-    bad = np.flatnonzero(~np.isfinite(scales).all(axis=1) | (scales == 0).any(axis=1))
-    if bad.size:
-        value = gaussians.log_scales[bad[0]].tolist()
-        raise InputError(f"the scales of row {bad[0]}, e^{value}, are beyond float32: remove its Gaussian")
+    scales = scales_of(gaussians)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats.astype(np.float64), axis=1, keepdims=True)
     colors = np.concatenate([color_bytes(gaussians.sh_dc), opacity_bytes(gaussians.opacity_logits)[:, None]], axis=1)
     n_rest = gaussians.sh_rest.shape[1]

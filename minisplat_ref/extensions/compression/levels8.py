@@ -88,6 +88,23 @@ def check_float32(gaussians: Gaussians) -> None:
         check_gaussians(Gaussians(*(field.astype(np.float32) for field in gaussians)), "Gaussians")
 
 
+def scales_of(gaussians: Gaussians) -> NDArray[np.float32]:
+    """Return the scales [N, 3] of Gaussians, for files that do not hold their logarithms.
+
+    Raises
+    ------
+    InputError
+        One is infinite or zero in float32.
+    """
+    with np.errstate(over="ignore"):
+        scales = np.exp(gaussians.log_scales.astype(np.float64)).astype("<f4")
+    bad = np.flatnonzero(~np.isfinite(scales).all(axis=1) | (scales == 0).any(axis=1))
+    if bad.size:
+        value = gaussians.log_scales[bad[0]].tolist()
+        raise InputError(f"the scales of row {bad[0]}, e^{value}, are beyond float32: remove its Gaussian")
+    return scales
+
+
 def refuse_size(source: str | Path, needed: int, found: int) -> None:
     """Refuse a file that is shorter than it says.
 

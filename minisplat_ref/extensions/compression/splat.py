@@ -25,6 +25,7 @@ from minisplat_ref.extensions.compression.levels8 import (
     finish,
     logits_of,
     opacity_bytes,
+    scales_of,
     sh_dc_of,
 )
 from minisplat_ref.io.formats import Format
@@ -43,12 +44,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     """
     check_float32(gaussians)
     rows = np.empty(len(gaussians.means), ROW)
-    with np.errstate(over="ignore"):
-        rows["scales"] = np.exp(gaussians.log_scales.astype(np.float64))
-    bad = np.flatnonzero(~np.isfinite(rows["scales"]).all(axis=1) | (rows["scales"] == 0).any(axis=1))
-    if bad.size:
-        value = gaussians.log_scales[bad[0]].tolist()
-        raise InputError(f"the scales of row {bad[0]}, e^{value}, are beyond float32: remove its Gaussian")
+    rows["scales"] = scales_of(gaussians)
     if gaussians.sh_rest.size:
         warnings.warn(".splat holds no harmonics above degree 0: they are left out", InputWarning, stacklevel=2)
     rows["means"] = gaussians.means

@@ -109,10 +109,10 @@ def corner_weights(corner_logits: Floats) -> Floats:
 
 
 def on_own_faces(gaussians: Gaussians, rng: np.random.Generator) -> FaceGaussians:
-    """Return each Gaussian in the middle of a face of its own, which has its rotation, and its scales for rho = 1.
+    """Return each Gaussian in the middle of a face of its own, which gives it its rotation, and its scales for rho = 1.
 
-    What :func:`place` makes of it has its mean, its rotation, and its second and third scale; it is flat along its
-    first axis. The corners are ``m + 2 c_i``-like: with s2 and s3 along r2 and r3,
+    :func:`place` then returns its mean, its rotation, and its second and third scale; along its first axis it is flat.
+    With the mean m, and s2 and s3 along r2 and r3, the corners are
 
         p0 = m + s2 r2,   p1 = m - s2/2 r2 + s3 r3,   p2 = m - s2/2 r2 - s3 r3
     """

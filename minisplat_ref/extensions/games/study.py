@@ -22,7 +22,7 @@ from minisplat_ref.mechanisms.fusion.kernels import fuse
 from minisplat_ref.mechanisms.fusion.volume import DepthMap, Grid, empty_volume
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.reference.pinhole import points_at
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY
@@ -83,12 +83,8 @@ def start(scene: Scene, recipe: Recipe, mesh: Mesh, per_face: int, seed: int) ->
 
 def true_points(made: SyntheticScene) -> Floats:
     """Return the points [P, 3] of the surface that the pixels of the training views show."""
-    points = []
-    for view, depth in zip(made.scene.train_views, made.train_depths, strict=True):
-        camera, (y, x) = view.camera, np.nonzero(depth)
-        in_camera = depth[y, x][:, None] * pinhole_rays(x + 0.5, y + 0.5, camera)
-        points.append((in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R)
-    return np.concatenate(points)
+    shown = zip(made.train_depths, made.scene.train_views, strict=True)
+    return np.concatenate([points_at(depth, view.camera) for depth, view in shown])
 
 
 def depths_of(gaussians: Gaussians, made: SyntheticScene) -> Sequence[Floats]:

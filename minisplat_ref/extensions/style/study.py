@@ -17,7 +17,7 @@ from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.style.styling import Plan, stylise
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
-from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.reference.pinhole import points_at, project_into_image
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies import kit
@@ -140,15 +140,9 @@ def disagreement(
     """Return the mean absolute difference of colours [P] at the pixels of one view whose point the other shows, too."""
     first, second = cameras
     y, x = np.nonzero(depths[0])
-    in_first = depths[0][y, x][:, None] * pinhole_rays(x + 0.5, y + 0.5, first)
-    world = (in_first - first.cam_from_world_t) @ first.cam_from_world_R
-    in_second = world @ second.cam_from_world_R.T + second.cam_from_world_t
-    z = in_second[:, 2]
-    is_ahead = z > 0
-    u = np.floor(second.fx * in_second[:, 0] / np.where(is_ahead, z, 1) + second.cx).astype(int)
-    v = np.floor(second.fy * in_second[:, 1] / np.where(is_ahead, z, 1) + second.cy).astype(int)
-    is_inside = is_ahead & (u >= 0) & (u < second.width) & (v >= 0) & (v < second.height)
-    here, there, z = (y[is_inside], x[is_inside]), (v[is_inside], u[is_inside]), z[is_inside]
+    rows, xy, z = project_into_image(points_at(depths[0], first), second)
+    u, v = np.floor(xy).astype(int).T
+    here, there = (y[rows], x[rows]), (v, u)
     is_same = np.abs(depths[1][there] - z) < DEPTH_TOLERANCE * z
     differences = np.abs(images[0][here] - images[1][there]).mean(axis=1)
     return np.asarray(differences[is_same])
