@@ -17,6 +17,7 @@ VIEWER_PORT = 8080
 SYNTHETIC_SCENES = (  # datasets.synthetic.SCENE_NAMES, which would load NumPy
     *("room", "plain-wall", "glossy", "outdoor"),
     *("staircase", "noisy-sphere", "facing-spheres", "box-city"),
+    *("park-1", "park-4", "park-16"),
 )
 
 
@@ -164,19 +165,15 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
     )
 
 
-def add_worker_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers`` and ``--cluster``, of which at most one may be given."""
+def add_worker_arguments(parser: argparse.ArgumentParser, is_shown: bool = True) -> None:
+    """Add ``--workers`` and ``--cluster``, of which at most one may be given; the help may leave them out."""
+    here = "train in N processes at once (default 0: in turn)"
+    elsewhere = "train by the workers of a Dask scheduler, tcp://HOST:PORT"
+    if not is_shown:
+        here = elsewhere = argparse.SUPPRESS
     group = parser.add_mutually_exclusive_group()
-    group.add_argument(
-        "--workers", type=integer(0), default=0, metavar="N", help="train in N processes at once (default 0: in turn)"
-    )
-    group.add_argument(
-        "--cluster",
-        type=name,
-        default=None,
-        metavar="ADDRESS",
-        help="train by the workers of a Dask scheduler, tcp://HOST:PORT",
-    )
+    group.add_argument("--workers", type=integer(0), default=0, metavar="N", help=here)
+    group.add_argument("--cluster", type=name, default=None, metavar="ADDRESS", help=elsewhere)
 
 
 def decibels(text: str) -> float:

@@ -22,6 +22,10 @@ and four whose surface is the subject:
   noisy-sphere    a ball; its points err by a twentieth of the radius
   facing-spheres  two balls, of which each hides part of the other
   box-city        blocks with narrow streets
+
+and one to be trained in blocks, of 1, 4 or 16 squares of 4 m:
+
+  park-1, park-4, park-16    hedges, boulders and beds, seen while walking
 """
 EPILOG = """\
 example:

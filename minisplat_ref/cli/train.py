@@ -1,6 +1,7 @@
 """``train``: from photographs with cameras to a folder with Gaussians, metrics and images."""
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from minisplat_ref.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
+    add_worker_arguments,
     assignment,
     color,
     decibels,
@@ -21,6 +23,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
+    from minisplat_ref.blocks.plan import Asked
     from minisplat_ref.lpips import Network
     from minisplat_ref.runs.run import Watch
     from minisplat_ref.runs.settings import Settings
@@ -56,6 +59,7 @@ DEFAULTS: dict[str, Any] = {
     "background": None,
     "max_drop": None,
     "max_bytes": None,
+    "block": None,
 }
 AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new when a run is continued
 
@@ -90,6 +94,11 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
 
     parser.add_argument("--preview", action="store_true", help="keep DIR/preview.png up to date; --view: in a browser")
+    parser.add_argument(
+        "--blocks", type=_shape, metavar="AxB", help="train in A x B parts; --workers N, --cluster ADDRESS: at once"
+    )
+    parser.add_argument("--block", type=Path, metavar="PART", help=argparse.SUPPRESS)  # one of them
+    add_worker_arguments(parser, is_shown=False)
     parser.add_argument("--view", nargs="?", type=integer(0), const=VIEWER_PORT, metavar="PORT", help=argparse.SUPPRESS)
 
     data = parser.add_argument_group("photographs")
@@ -157,9 +166,9 @@ def add_parser(commands: Commands) -> None:
     )
     training.add_argument("--seed", type=integer(0), metavar="S", help="seed of all random draws (default 0)")
     training.add_argument(
-        "--check-every", type=integer(1), metavar="K", help="look for NaN in every K-th iteration (default 10)"
+        "--check-every", type=integer(1), metavar="K", help="look for NaN every K steps (10); --drop-bad-steps: skip"
     )
-    training.add_argument("--drop-bad-steps", action="store_true", help="skip steps with NaN instead of stopping")
+    training.add_argument("--drop-bad-steps", action="store_true", help=argparse.SUPPRESS)
     add_renderer_arguments(training, argparse.SUPPRESS)
     parser.set_defaults(run=run, needs=("matplotlib",))
 
@@ -190,18 +199,25 @@ def _start(given: dict[str, Any]) -> int:
         options["iterations"] = _default_iterations(options["recipe"])
     options["set"] = dict(options["set"])  # of equal names the last
     options["background"] = None if options["background"] is None else list(options["background"])
-    for name in ("lpips_weights", "init"):
+    for name in ("lpips_weights", "init", "block"):
         options[name] = _absolute(options[name])
     scene_path = Path(given["scene"])
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
+    if "blocks" in given and options["block"] is not None:
+        raise InputError("--block is one part of a training in --blocks: give one of the two")
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
+    from minisplat_ref.cli import train_blocks
     from minisplat_ref.runs import curve, run_folder
     from minisplat_ref.runs.first_use import compile_kernels
     from minisplat_ref.runs.notices import report_inventory, warn_of_scene
     from minisplat_ref.runs.proposed_size import propose
     from minisplat_ref.runs.settings import Settings, check_frame, load_lpips, load_photographs, recipe_of
 
+    if "blocks" in given:
+        train_blocks.refuse_options(given)
+    elif given["workers"] or given["cluster"]:
+        raise InputError("--workers and --cluster train blocks at once: give --blocks AxB, too, or leave them out")
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
     recipe = recipe_of(settings)
@@ -212,6 +228,12 @@ def _start(given: dict[str, Any]) -> int:
         curve.check_views(scene)
     network = load_lpips(settings, scene)
     state = _first_state(settings, scene, recipe)
+    if "blocks" in given:
+        from minisplat_ref.blocks.plan import Asked
+
+        asked = Asked(folder, settings, given["blocks"])
+        train_blocks.start(asked, recipe, scene, state)
+        return _train_blocks(asked, given)
     _check_target(folder, settings, recipe, scene, state)
     room = _check_room(scene, state, settings)
     compile_kernels(settings.backend)
@@ -224,11 +246,24 @@ def _start(given: dict[str, Any]) -> int:
     with run_folder.hold_folder(folder):
         run_folder.check_free(folder)  # another process may have trained there meanwhile
         try:
-            return _train(folder, scene, settings, recipe, state, network, given, room)
+            return _train(folder, scene, recipe, state, settings, given, network, room)
         except InputError:
             if state.step == 0:
                 run_folder.remove(folder)
             raise
+
+
+def _train_blocks(asked: "Asked", given: dict[str, Any]) -> int:
+    """Train in blocks from where that is, and end like a run of the whole."""
+    from minisplat_ref.cli.train_blocks import go_on
+    from minisplat_ref.runs import run_folder
+    from minisplat_ref.runs.cluster import Workers
+
+    end = go_on(asked, Workers(given["workers"], given["cluster"]))
+    if isinstance(end, int):
+        return end
+    with run_folder.hold_folder(asked.folder):
+        return _train(asked.folder, *end, asked.settings, given)
 
 
 def _with_config(given: dict[str, Any]) -> dict[str, Any]:
@@ -240,7 +275,7 @@ def _with_config(given: dict[str, Any]) -> dict[str, Any]:
     config = load(path.parent if path.name == CONFIG else path)
     settings: dict[str, Any] = {name: getattr(config, name) for name in ("scene", *DEFAULTS)}
     settings["set"] = [*config.set.items(), *given.get("set", ())]
-    for name in ("lpips_weights", "init"):
+    for name in ("lpips_weights", "init", "block"):
         settings[name] = None if settings[name] is None else Path(settings[name])
     return {**settings, **given, "set": settings["set"]}
 
@@ -287,6 +322,7 @@ def _default_iterations(name: str) -> int:
 
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from what --init gives."""
+    from minisplat_ref.runs.part import read_part
     from minisplat_ref.runs.start import start_from
 
     start = start_from(settings.init, scene, recipe, settings.seed)
@@ -294,7 +330,7 @@ def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "Tra
         print(f"minisplat-ref: {notice}", file=sys.stderr)
     if start.source is not None:
         print(f"starts from {start.source}")
-    return start.state
+    return start.state if settings.block is None else read_part(Path(settings.block)).crop(start.state)
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:
@@ -304,9 +340,15 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
             f"--resume takes the run's own settings: leave out {', '.join(option_name(name) for name in surplus)}"
         )
 
+    from minisplat_ref.blocks.plan import load_asked
+    from minisplat_ref.blocks.train import is_unfinished
     from minisplat_ref.runs import checkpoints, fingerprint, run_folder, settings
     from minisplat_ref.runs.first_use import compile_kernels
 
+    if is_unfinished(folder):
+        if surplus := [name for name in (*AFRESH, "moved", "rescale") if name in given]:
+            raise InputError(f"the blocks of {folder} have not ended: leave out {option_name(surplus[0])}")
+        return _train_blocks(load_asked(folder), given)
     ours = settings.load(folder)
     with run_folder.hold_folder(folder):
         ours = ours._replace(**{name: given[name] for name in AFRESH if name in given})
@@ -334,7 +376,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         room = _check_room(scene, state, ours)
         compile_kernels(ours.backend)
         print(_how_it_goes_on(state, ours, is_rescaled="rescale" in given))
-        return _train(folder, scene, ours, recipe, state, network, given, room)
+        return _train(folder, scene, recipe, state, ours, given, network, room)
 
 
 def _check_room(scene: "Scene", state: "TrainState", settings: "Settings") -> str:
@@ -363,12 +405,12 @@ def _how_it_goes_on(state: "TrainState", settings: "Settings", is_rescaled: bool
 def _train(
     folder: Path,
     scene: "Scene",
-    settings: "Settings",
     recipe: "Recipe",
     state: "TrainState",
-    network: "Network | None",
+    settings: "Settings",
     given: dict[str, Any],
-    room: str,
+    network: "Network | None" = None,
+    room: str = "",
 ) -> int:
     from minisplat_ref.runs import checkpoints, run_folder
     from minisplat_ref.runs.model_file import describe_parts, missing_parts
@@ -447,3 +489,10 @@ def _simplify(folder: Path, settings: "Settings") -> int:
 def _absolute(path: Path | None) -> str | None:
     """Return a path as the settings of a run keep it: they are read from other folders, too."""
     return None if path is None else str(path.resolve())
+
+
+def _shape(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,3})[xX]([1-9]\d{0,3})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of blocks along two axes such as 2x2")
+    return int(match[1]), int(match[2])

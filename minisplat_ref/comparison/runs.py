@@ -4,46 +4,24 @@ A comparison that was cut off continues where it was: finished runs stay, one wi
 """
 
 import contextlib
-import shutil
-import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any, Literal
+from typing import Any
 
 from minisplat_ref.arguments import option_name
 from minisplat_ref.comparison.plan import Plan, Run, load_plan
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.cluster import Workers, carry_out_all
 from minisplat_ref.runs.settings import Settings
-from minisplat_ref.runs.settings import load as load_settings
+from minisplat_ref.runs.trainings import HEADINGS, Status, status_of, train_here, words_to_end
 from minisplat_ref.runs.worker import Job
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 
 WARM_UP = 20  # iterations, to which each recipe is scaled, so that all its events happen
 WARM_UP_VIEWS = 4
-SAVING_SECONDS = 5.0  # after Ctrl-C; a training that continues for longer has not been told
-
-PROGRAM = (sys.executable, "-m", "minisplat_ref")
-
-Status = Literal["finished", "cut off", "lost", "new"]
-"""How far a training has come: to its end, to a checkpoint, not as far, or not begun."""
-
-HEADINGS: dict[Status, str] = {
-    "finished": ": finished, kept",
-    "cut off": ": continued from its checkpoint",
-    "lost": ": has no checkpoint, started again",
-    "new": ": started",
-}
-
-REPORTED_CODES = (0, 2, 130)  # after which the training has said all there is to say
 
 
 def warm_up(plan: Plan, scene: Scene) -> None:
@@ -63,25 +41,7 @@ def statuses(plan: Plan) -> list[Status]:
     InputError
         In the place of a run folder is a run of other settings, or something else.
     """
-    return [_status(plan, run) for run in plan.runs]
-
-
-def _status(plan: Plan, run: Run) -> Status:
-    if not (run.folder / run_folder.CONFIG).exists():
-        run_folder.check_free(run.folder)
-        return "new"
-    ours, asked = load_settings(run.folder), settings_of(plan, run)
-    for name in Settings._fields:
-        is_, should = getattr(ours, name), getattr(asked, name)
-        if is_ != should:
-            raise InputError(
-                f"{run.folder} holds a run of other settings, {name} is {is_} and not {should}: move it away, or give"
-                " another --out"
-            )
-    if run_folder.is_finished(run.folder, run.iterations):
-        return "finished"
-    has_checkpoint = any((run.folder / name).exists() for name in (run_folder.CHECKPOINT, run_folder.PREVIOUS))
-    return "cut off" if has_checkpoint else "lost"
+    return [status_of(run.folder, settings_of(plan, run)) for run in plan.runs]
 
 
 def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
@@ -108,7 +68,7 @@ def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
     for number, status in enumerate(statuses):
         print(_name(plan, number) + HEADINGS[status], flush=True)  # before the lines of the other process
         words = next_words(plan, number)
-        code = 0 if words is None else _train([*PROGRAM, *words])
+        code = 0 if words is None else train_here(words)
         if code != 0:
             return code
     return 0
@@ -157,14 +117,7 @@ def next_words(plan: Plan, number: int) -> list[str] | None:
         Index of the training in ``plan.runs``.
     """
     run = plan.runs[number]
-    status = _status(plan, run)
-    if status == "finished":
-        return None
-    if status == "cut off":
-        return ["train", "--resume", str(run.folder)]
-    if status == "lost":
-        shutil.rmtree(run.folder)
-    return _first_words(plan, run)
+    return words_to_end(run.folder, settings_of(plan, run), _first_words(plan, run))
 
 
 def _first_words(plan: Plan, run: Run) -> list[str]:
@@ -202,44 +155,3 @@ def _options(plan: Plan, run: Run) -> dict[str, Any]:
         **plan.files,
         **run.options,
     }
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which the system sends to this process alone, while Ctrl-C reaches its trainings too."""
-
-
-@contextlib.contextmanager
-def _raising_terminated() -> Iterator[None]:
-    """Make SIGTERM raise :class:`_Terminated`, in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def raise_terminated(number: int, frame: FrameType | None) -> None:
-        raise _Terminated
-
-    previous = signal.signal(signal.SIGTERM, raise_terminated)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
-
-
-def _train(command: list[str]) -> int:
-    with subprocess.Popen(command) as process, _raising_terminated():
-        try:
-            code = process.wait()
-        except _Terminated:
-            process.terminate()  # it saves now, as after Ctrl-C, however long that takes
-            process.wait()
-            raise
-        except KeyboardInterrupt:
-            # A terminal's Ctrl-C has reached the training, too, which saves now and is better left alone.
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(SAVING_SECONDS)
-            process.send_signal(signal.SIGINT)  # does nothing when the training has ended
-            process.wait()
-            raise
-    if code not in REPORTED_CODES:
-        raise subprocess.CalledProcessError(code, command)
-    return code

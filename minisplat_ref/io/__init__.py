@@ -1,6 +1,6 @@
 """Files in and out: scenes of photographs, Gaussians, images."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ def load_scene(
     undistort: bool = False,
     as_photographed: bool = False,
     model: str | None = None,
+    only: Collection[str] | None = None,
 ) -> Scene:
     """Load a scene of photographs with cameras, whichever way it is described.
 
@@ -39,7 +40,7 @@ def load_scene(
     ----------
     path : str or Path
         Folder of a COLMAP scene or of a transforms.json (COLMAP wins where both are there), or a transforms.json file.
-    downscale, test_every, background, undistort, as_photographed
+    downscale, test_every, background, undistort, as_photographed, only
         See :func:`load_colmap` and :func:`load_transforms`.
     model : str, optional
         Folder of a COLMAP model, relative to ``path``, where there are several.
@@ -57,7 +58,7 @@ def load_scene(
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
     options: dict[str, Any] = {"downscale": downscale, "test_every": test_every, "background": background}
-    options |= {"undistort": undistort, "as_photographed": as_photographed}
+    options |= {"undistort": undistort, "as_photographed": as_photographed, "only": only}
     if find_model(path, model) is not None:
         return load_colmap(path, model=model, **options)
     if find_transforms(path):

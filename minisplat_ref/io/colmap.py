@@ -9,7 +9,7 @@ and images that COLMAP could not register.
 import re
 import struct
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,6 +60,7 @@ def load_colmap(
     undistort: bool = False,
     as_photographed: bool = False,
     model: str | None = None,
+    only: Collection[str] | None = None,
 ) -> Scene:
     """Load a COLMAP scene.
 
@@ -80,6 +81,8 @@ def load_colmap(
         Leave them as they are, with cameras that have ``optics``.
     model : str, optional
         Folder of the model, relative to ``path``, where there are several; the first of those above by default.
+    only : collection of str, optional
+        Names of the views to read; all by default.
 
     Returns
     -------
@@ -91,7 +94,7 @@ def load_colmap(
         If a file is missing or damaged, a camera model is distorted, or an image does not fit its camera.
     """
     path = Path(path)
-    reading = build_reading(downscale, background, undistort, True, as_photographed)
+    reading = build_reading(downscale, background, undistort, True, as_photographed, only)
     reconstruction = read_model(path, model)
     train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every)
     points, colors = _points(reconstruction)

@@ -107,6 +107,11 @@ def place_points(points: Floats, frame: Frame) -> Floats:
     return points if frame == FILE_FRAME else (points.astype(np.float64) - np.array(frame.origin)) / frame.unit
 
 
+def return_points(points: Floats, frame: Frame) -> Floats:
+    """Return points [P, 3] of a frame as in the files, float64: ``origin + unit x``."""
+    return np.array(frame.origin) + frame.unit * points.astype(np.float64)
+
+
 def place_scene(scene: Scene, frame: Frame | None = None) -> Scene:
     """Return a scene in another frame.
 

@@ -7,7 +7,7 @@ only sizes are checked here, and pixels are read on demand (:mod:`minisplat_ref.
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,6 +81,8 @@ class Reading(NamedTuple):
     """An alpha channel masks the loss; False composites it onto the background."""
     as_photographed: bool = False
     """Leave photographs of other lenses as they are, and describe the lens by the camera's ``optics``."""
+    only: Collection[str] | None = None
+    """Names of the views to read, of a part of a scene; None for all."""
 
 
 def build_reading(
@@ -89,6 +91,7 @@ def build_reading(
     undistort: bool,
     alpha_is_mask: bool,
     as_photographed: bool = False,
+    only: Collection[str] | None = None,
 ) -> Reading:
     """Check the arguments that all loaders share."""
     if downscale < 1 or downscale != int(downscale):
@@ -98,7 +101,7 @@ def build_reading(
         raise InputError(f"background is {background}; it must be three numbers in [0, 1]")
     if undistort and as_photographed:
         raise InputError("photographs are either undistorted or read as they are: leave out one of the two")
-    return Reading(int(downscale), color, undistort, alpha_is_mask, as_photographed)
+    return Reading(int(downscale), color, undistort, alpha_is_mask, as_photographed, only)
 
 
 def split_photos(photos: Sequence[Photo], test_every: int) -> tuple[list[Photo], list[Photo]]:
@@ -143,6 +146,8 @@ def build_scene(
     InputError
         If there are too few views, a camera is not usable, or an image is missing or does not fit its camera.
     """
+    if reading.only is not None:
+        train_photos, test_photos = _select(train_photos, test_photos, reading.only, source)
     photos = (*train_photos, *test_photos)
     if len(train_photos) < TRAIN_VIEWS_MIN:
         raise InputError(
@@ -179,6 +184,20 @@ def build_scene(
         background=reading.background,
         extent=camera_extent(cameras),
     )
+
+
+def _select(
+    train_photos: Sequence[Photo], test_photos: Sequence[Photo], only: Collection[str], source: Path
+) -> tuple[list[Photo], list[Photo]]:
+    """Return the photographs whose views have one of the names."""
+    photos = (*train_photos, *test_photos)
+    names = _view_names(photos, source)
+    if absent := set(only).difference(names):
+        raise InputError(f"{source}: photograph {min(absent)} is not there any more, and a part of the scene needs it")
+    chosen = [name in only for name in names]
+    n = len(train_photos)
+    train = [photo for photo, is_chosen in zip(train_photos, chosen[:n], strict=True) if is_chosen]
+    return train, [photo for photo, is_chosen in zip(test_photos, chosen[n:], strict=True) if is_chosen]
 
 
 def _check_places(source: Path, cameras: Sequence[Camera]) -> None:

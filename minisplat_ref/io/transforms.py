@@ -16,7 +16,7 @@ exposure, rolling shutter.
 import math
 import reprlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ def load_transforms(
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
     as_photographed: bool = False,
+    only: Collection[str] | None = None,
 ) -> Scene:
     """Load a scene described by transforms.json.
 
@@ -65,6 +66,8 @@ def load_transforms(
         Warp images with lens distortion to a pinhole, instead of refusing them.
     as_photographed : bool
         Leave them as they are, with cameras that have ``optics``.
+    only : collection of str, optional
+        Names of the views to read; all by default.
 
     Returns
     -------
@@ -76,7 +79,7 @@ def load_transforms(
         If a file is missing or malformed, no image exists, there is distortion, or an image does not fit its camera.
     """
     path = Path(path)
-    reading = build_reading(downscale, background, undistort, False, as_photographed)
+    reading = build_reading(downscale, background, undistort, False, as_photographed, only)
     files = find_transforms(path)
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")

@@ -23,6 +23,7 @@ PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
 CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
 DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
 REPORT = "report.html"  # all of it to look at
+BLOCKS = "blocks"  # the trainings of which it was merged, where it was trained in blocks
 RENDERS = "renders"  # truth | render | error of each test view
 
 WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # what has taken time; a run without any has not begun
@@ -42,6 +43,11 @@ def check_free(folder: Path) -> None:
     if CONFIG in names and names & WORK:
         raise InputError(
             f"{folder} already holds a run: give another --out, or continue it with train --resume {folder}"
+        )
+    if BLOCKS in names:
+        raise InputError(
+            f"{folder} already holds a training in blocks: give another --out, or continue it with train --resume"
+            f" {folder}"
         )
     if names and CONFIG not in names:
         raise InputError(f"{folder} is not an empty folder: give another --out")

@@ -33,6 +33,7 @@ from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.mechanisms.cameras.models import check_optics
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.model_file import label_for
+from minisplat_ref.runs.part import read_part
 from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.calibration import SHIFTS
@@ -96,6 +97,8 @@ class Settings(NamedTuple):
     """Folder of the COLMAP model, relative to the scene; None for the first that is there."""
     background: list | None = None
     """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
+    block: str | None = None
+    """Absolute path of the part of the scene, a :class:`~minisplat_ref.runs.part.Part`; None for the whole."""
 
 
 def recipe_of(settings: Settings) -> Recipe:
@@ -288,6 +291,7 @@ def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
         See :func:`minisplat_ref.io.load_scene`.
     """
     owner = owner_of(settings.recipe, settings.extension) or CORE
+    part = None if settings.block is None else read_part(Path(settings.block))
     scene = load_scene(
         settings.scene,
         downscale=settings.downscale,
@@ -296,7 +300,9 @@ def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
         undistort=settings.undistort,
         as_photographed=owner.representation.takes_optics and not settings.undistort,
         model=settings.model,
+        only=None if part is None else part.masks.keys(),
     )
+    scene = scene if part is None else part.narrow(scene)
     for view in (*scene.train_views, *scene.test_views):
         try:
             check_optics(view.camera)

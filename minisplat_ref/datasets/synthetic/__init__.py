@@ -1,7 +1,7 @@
 """Synthetic scenes with exact truth: photographs, depth, normals, ids and sparse points, ray-traced with NumPy.
 
-Reading order: shapes, geometry, materials, tracer, cameras, furniture, lights, truths, scenes, sparse_points; files
-writes a scene as a COLMAP folder, and triangles makes a mesh of a world.
+Reading order: shapes, geometry, materials, tracer, cameras, furniture, lights, truths, park, scenes, sparse_points;
+files writes a scene as a COLMAP folder, and triangles makes a mesh of a world.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.datasets.synthetic.cameras import orbit_cameras
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.sparse_points import sample_points
 from minisplat_ref.datasets.synthetic.tracer import TracedView, World, trace_view
@@ -105,10 +104,10 @@ def make_scene(
     if point_noise is not None and not (0.0 <= point_noise < np.inf):
         raise InputError(f"point_noise is {point_noise}; give a finite number of metres, 0 or more")
     scene_rng, camera_rng, point_rng = np.random.default_rng(seed).spawn(3)
-    world, orbit, usual_noise = SETTINGS[name](scene_rng)
+    world, path, usual_noise = SETTINGS[name](scene_rng)
     noise = usual_noise if point_noise is None else point_noise
     n_total = n_views + (-(-n_views // (test_every - 1)) if test_every else 0)
-    cameras = orbit_cameras(orbit, n_total, width, height, camera_rng)
+    cameras = path.cameras(n_total, width, height, camera_rng)
     traced = [trace_view(world, camera, supersampling) for camera in progress(cameras)]
     views = [View(f"view_{i:04d}", cameras[i], traced[i].image, None) for i in range(n_total)]
     test_ids = list(range(0, n_total, test_every)) if test_every else []

@@ -28,35 +28,32 @@ class Orbit(NamedTuple):
     fov_degrees: float
     """Horizontal field of view."""
 
+    def cameras(self, n_cameras: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
+        """Return cameras at equal angles around the target, at quasi-random radius and height.
 
-def orbit_cameras(orbit: Orbit, n_cameras: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
-    """Return cameras at equal angles around the target, at quasi-random radius and height.
+        Parameters
+        ----------
+        n_cameras : int
+            How many.
+        width, height : int
+            Image size, pixels.
+        rng : numpy.random.Generator
+            Draws where the ring starts.
 
-    Parameters
-    ----------
-    orbit : Orbit
-        The ring.
-    n_cameras : int
-        How many.
-    width, height : int
-        Image size, pixels.
-    rng : numpy.random.Generator
-        Draws where the ring starts.
-
-    Returns
-    -------
-    list of Camera
-        float64, in walking order.
-    """
-    steps = np.arange(n_cameras)
-    angles = 2.0 * np.pi * (steps / n_cameras + rng.random())
-    radii = _within(orbit.radius, (steps * EVEN_STEPS[0] + rng.random()) % 1.0)
-    heights = _within(orbit.height, (steps * EVEN_STEPS[1] + rng.random()) % 1.0)
-    positions = np.stack(
-        [orbit.target[0] + radii * np.cos(angles), orbit.target[1] + radii * np.sin(angles), heights], axis=1
-    )  # [n, 3]
-    focal = 0.5 * width / np.tan(0.5 * np.radians(orbit.fov_degrees))
-    return [look_at(position, orbit.target, focal, width, height) for position in positions]
+        Returns
+        -------
+        list of Camera
+            float64, in walking order.
+        """
+        steps = np.arange(n_cameras)
+        angles = 2.0 * np.pi * (steps / n_cameras + rng.random())
+        radii = _within(self.radius, (steps * EVEN_STEPS[0] + rng.random()) % 1.0)
+        heights = _within(self.height, (steps * EVEN_STEPS[1] + rng.random()) % 1.0)
+        positions = np.stack(
+            [self.target[0] + radii * np.cos(angles), self.target[1] + radii * np.sin(angles), heights], axis=1
+        )  # [n, 3]
+        focal = 0.5 * width / np.tan(0.5 * np.radians(self.fov_degrees))
+        return [look_at(position, self.target, focal, width, height) for position in positions]
 
 
 def look_at(position: Floats, target: Floats, focal: float, width: int, height: int) -> Camera:

@@ -24,7 +24,7 @@ from minisplat_ref.datasets.synthetic.furniture import (
     tree,
 )
 from minisplat_ref.datasets.synthetic.geometry import Primitive
-from minisplat_ref.datasets.synthetic.lights import light_square, studio
+from minisplat_ref.datasets.synthetic.lights import daylight, light_square, studio
 from minisplat_ref.datasets.synthetic.materials import (
     Bricks,
     Checker,
@@ -36,10 +36,10 @@ from minisplat_ref.datasets.synthetic.materials import (
     linear_rgb,
     random_lattice,
 )
+from minisplat_ref.datasets.synthetic.park import PARKS
 from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Sphere
 from minisplat_ref.datasets.synthetic.tracer import World
 from minisplat_ref.datasets.synthetic.truths import Setting, box_city, facing_spheres, noisy_sphere, staircase
-from minisplat_ref.types import Floats
 
 
 def room(rng: np.random.Generator) -> Setting:
@@ -132,16 +132,7 @@ def outdoor(rng: np.random.Generator) -> Setting:
         place(Sphere(0.18), stone, [-0.25, -1.0, 0.1]),
         place(Sphere(0.25), Stripes("#f5efe3", "#d2493f", 0.2, axis=0), [0.0, 0.1, 0.27], rotate_z(40)),
     ]
-    world = World(
-        primitives=tuple(primitives),
-        light_positions=light_square(np.array([60.0, -35.0, 70.0]), 1.5),
-        light_color=linear_rgb("#fff0d2") * 1.0,
-        light_reach=float(np.linalg.norm([60.0, -35.0, 70.0])),
-        ambient_above=linear_rgb("#9fb6d8"),
-        ambient_below=linear_rgb("#5a5240"),
-        sky=_Sky(Noise("#000000", "#ffffff", np.array([0.5, 0.5, 0.16]), lattice, n_octaves=4, contrast=2.0)),
-    )
-    return Setting(world, Orbit(np.array([0.0, 0.0, 0.75]), (3.3, 4.1), (0.7, 1.8), 60.0))
+    return Setting(daylight(primitives, lattice), Orbit(np.array([0.0, 0.0, 0.75]), (3.3, 4.1), (0.7, 1.8), 60.0))
 
 
 SETTINGS: dict[str, Callable[[np.random.Generator], Setting]] = {
@@ -153,6 +144,7 @@ SETTINGS: dict[str, Callable[[np.random.Generator], Setting]] = {
     "noisy-sphere": noisy_sphere,
     "facing-spheres": facing_spheres,
     "box-city": box_city,
+    **PARKS,
 }
 """The scenes by name."""
 
@@ -172,20 +164,6 @@ def _lamp_world(primitives: list[Primitive]) -> World:
         ambient_below=linear_rgb("#978b83"),
         sky=None,
     )
-
-
-class _Sky:
-    """Clouds on a gradient from a pale horizon to a blue zenith."""
-
-    def __init__(self, clouds: Noise) -> None:
-        self.clouds = clouds
-
-    def __call__(self, directions: Floats) -> Floats:
-        up = np.clip(directions[:, 2], 0.0, 1.0)  # [n]
-        horizon, zenith = linear_rgb("#dbe7f0"), linear_rgb("#4f8fd0")
-        clear = horizon + np.sqrt(up)[:, None] * (zenith - horizon)  # [n, 3]
-        cover = np.clip(2.0 * self.clouds.values(directions) - 1.0, 0.0, 1.0) * np.minimum(4.0 * up, 1.0)
-        return clear + 0.85 * cover[:, None] * (1.0 - clear)
 
 
 def _polish(texture: Texture, reflectance: float) -> Material:

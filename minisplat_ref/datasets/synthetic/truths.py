@@ -5,7 +5,7 @@ twentieth of its radius. ``facing-spheres``: two balls with a gap, in which each
 with narrow streets, of which few views see the ground.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from minisplat_ref.datasets.synthetic.materials import (
 )
 from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Sphere
 from minisplat_ref.datasets.synthetic.tracer import World
+from minisplat_ref.types import Camera
 
 N_STEPS, RISE, TREAD = 5, 0.16, 0.3
 RADIUS, RELATIVE_NOISE = 0.5, 0.05
@@ -31,12 +32,19 @@ GAP = 0.16  # between the two spheres
 N_BLOCKS, BLOCK, STREET = 4, 0.3, 0.14
 
 
+class Path(Protocol):
+    """Where the photographer goes."""
+
+    def cameras(self, n_cameras: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
+        """Return cameras in walking order, float64."""
+
+
 class Setting(NamedTuple):
     """A world and the camera path around it."""
 
     world: World
     """The surfaces and the light."""
-    orbit: Orbit
+    path: Path
     """The camera path."""
     point_noise: float = 0.0
     """Standard deviation of the error of each sparse point's coordinates, metres, unless asked otherwise."""

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from minisplat_ref.datasets.synthetic.cameras import orbit_cameras
 from minisplat_ref.datasets.synthetic.geometry import first_hits
 from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
@@ -96,8 +95,8 @@ def photograph(world: World, camera: Camera) -> Any:
 def take_photographs(width: int, seed: int) -> Photographs:
     """Return the photographs of a room, ``width`` and three quarters of it in size, every fourth held out."""
     scene_rng, camera_rng, point_rng = np.random.default_rng(seed).spawn(3)
-    world, orbit, _ = SETTINGS["room"](scene_rng)
-    cameras = orbit_cameras(orbit, N_VIEWS, width, 3 * width // 4, camera_rng)
+    world, path, _ = SETTINGS["room"](scene_rng)
+    cameras = path.cameras(N_VIEWS, width, 3 * width // 4, camera_rng)
     bent = [fisheye_of(camera) for camera in cameras]
     views = [View(f"{i:04d}", camera, photograph(world, camera), None) for i, camera in enumerate(bent)]
     straight = [_undistorted(view) for view in views]
