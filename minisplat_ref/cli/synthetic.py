@@ -17,15 +17,15 @@ arguments give equal bytes.
   outdoor      open ground under a sky that has no depth
 
 and four whose surface is the subject:
-
   staircase       planes at right angles, with steps in depth
   noisy-sphere    a ball; its points err by a twentieth of the radius
   facing-spheres  two balls, of which each hides part of the other
   box-city        blocks with narrow streets
 
-and one to be trained in blocks, of 1, 4 or 16 squares of 4 m:
-
-  park-1, park-4, park-16    hedges, boulders and beds, seen while walking
+and a park to be trained in blocks, in squares of 4 m:
+  park-1     hedges, boulders and beds, seen while walking
+  park-4     four such squares
+  park-16    sixteen
 """
 EPILOG = """\
 example:

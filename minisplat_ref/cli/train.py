@@ -95,7 +95,7 @@ def add_parser(commands: Commands) -> None:
 
     parser.add_argument("--preview", action="store_true", help="keep DIR/preview.png up to date; --view: in a browser")
     parser.add_argument(
-        "--blocks", type=_shape, metavar="AxB", help="train in A x B parts; --workers N, --cluster ADDRESS: at once"
+        "--blocks", type=_shape, metavar="AxB", help="in A x B parts; at once: --workers N, --cluster ADDRESS"
     )
     parser.add_argument("--block", type=Path, metavar="PART", help=argparse.SUPPRESS)  # one of them
     add_worker_arguments(parser, is_shown=False)

@@ -122,6 +122,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "max_bytes": None,
         "init": None,
         "background": None,
+        "block": None,
         "model": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]

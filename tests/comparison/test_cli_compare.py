@@ -37,6 +37,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.runs import trainings
 from minisplat_ref.runs.events import Mechanism
 from minisplat_ref.runs.fired import Fired, remarks, rows
 from minisplat_ref.runs.progress import read_log
@@ -168,7 +169,7 @@ def test_the_report_in_a_browser(compared, browser):
 
 def compare_with(command, monkeypatch, scene_folder, out):
     monkeypatch.setattr(runs_module, "warm_up", lambda plan, scene: None)
-    monkeypatch.setattr(runs_module, "PROGRAM", ())
+    monkeypatch.setattr(trainings, "PROGRAM", ())
     monkeypatch.setattr(runs_module, "_first_words", lambda plan, run: command)
     return main(["compare", str(scene_folder), *OPTIONS, "--out", str(out)])
 
@@ -221,7 +222,7 @@ def heeds_interrupts():
 @pytest.mark.parametrize(("who", "saving_seconds"), [("too", 30.0), ("not", 0.1)])
 def test_interrupted_while_training(scene_folder, tmp_path, monkeypatch, capfd, heeds_interrupts, who, saving_seconds):
     """The training is interrupted as well, by the terminal, or it is not and must be told; once in both cases."""
-    monkeypatch.setattr(runs_module, "SAVING_SECONDS", saving_seconds)
+    monkeypatch.setattr(trainings, "SAVING_SECONDS", saving_seconds)
     out = tmp_path / "out"
     command = [sys.executable, "-c", TRAINING_THAT_SAVES, str(out), who]
     assert compare_with(command, monkeypatch, scene_folder, out) == 130

@@ -40,15 +40,15 @@ def scene_folder(tmp_path_factory):
 def stopped(scene_folder, tmp_path_factory):
     """A comparison that Ctrl-C ended after its first training, before its second."""
     folder = tmp_path_factory.mktemp("comparisons") / "stopped"
-    train = runs_module._train
+    train = runs_module.train_here
 
-    def press_ctrl_c(command):
-        if SECOND in command[-1]:
+    def press_ctrl_c(words):
+        if SECOND in words[-1]:
             raise KeyboardInterrupt
-        return train(command)
+        return train(words)
 
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as errors:
-        patch.setattr(runs_module, "_train", press_ctrl_c)
+        patch.setattr(runs_module, "train_here", press_ctrl_c)
         assert main(["compare", str(scene_folder), *OPTIONS, "--out", str(folder)]) == 130
     lines = [line for line in errors.getvalue().splitlines() if "interrupted" in line]
     assert lines == [f"minisplat-ref: interrupted; to continue: minisplat-ref compare --resume {folder}"]
