@@ -1,6 +1,12 @@
 """``train --blocks`` end to end: the folder, the merge, every phase killed and continued, workers, refusals."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +17,7 @@ from minisplat_ref.cli import main, train_blocks
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply
+from minisplat_ref.runs import cluster
 from run_commands import contents, read_json, refused  # noqa: F401  (a fixture)
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 120, "test_every": 4}
@@ -90,7 +97,10 @@ def test_blocks_start_from_the_coarse_model_in_their_regions(finished):
     assert asked.shape == (2, 1)
 
 
-@pytest.mark.parametrize("phase", ["coarse", "0-0", "1-0", "plan", "merge"])
+SLOWLY = [pytest.param(phase, marks=pytest.mark.slow) for phase in ("coarse", "1-0")]
+
+
+@pytest.mark.parametrize("phase", ["0-0", "plan", "merge", *SLOWLY])
 def test_what_was_killed_continues(scene_folder, finished, tmp_path, monkeypatch, phase, capfd):
     """Ctrl-C in a training, an error of the program in the plan and in the merge: the same bytes in the end."""
     out = tmp_path / "out"
@@ -143,10 +153,53 @@ def test_adaptive_decides_for_each_block(scene_folder, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_workers_give_the_same_bytes(scene_folder, finished, tmp_path):
+@pytest.mark.parametrize("n", [1, 2])
+def test_workers_give_the_same_bytes(scene_folder, finished, tmp_path, n):
     pytest.importorskip("distributed")
-    assert begin(scene_folder, tmp_path / "out", "--workers", "2") == 0
+    assert begin(scene_folder, tmp_path / "out", "--workers", str(n)) == 0
     assert same_files(tmp_path / "out", finished)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", ["coarse", "1-0"])
+def test_a_killed_worker_loses_nothing(scene_folder, finished, tmp_path, monkeypatch, phase):
+    pytest.importorskip("distributed")
+    out, killed, check = tmp_path / "out", [], cluster._check
+
+    def kill_soon(client, site):
+        check(client, site)
+        pids = client.run(os.getpid)
+
+        def kill():
+            while not (out / "blocks" / phase).exists():
+                time.sleep(0.02)
+            os.kill(next(iter(pids.values())), signal.SIGKILL)
+            killed.append(phase)
+
+        is_planned = (out / "plan.png").exists()  # trainings have a cluster before the plan, and another one after
+        if is_planned == (phase != "coarse"):
+            threading.Thread(target=kill, daemon=True).start()
+
+    monkeypatch.setattr(cluster, "_check", kill_soon)
+    assert begin(scene_folder, out, "--workers", "1") == 0
+    assert phase in killed and same_files(out, finished)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", ["blocks/coarse", "blocks/0-0", "plan.png", "config.json"])
+def test_the_scheduler_is_killed(scene_folder, finished, tmp_path, phase):
+    """SIGKILL of the program that has the scheduler and makes the plan and the merge."""
+    pytest.importorskip("distributed")
+    out = tmp_path / "out"
+    words = ["train", str(scene_folder), *OPTIONS, *BLOCKS, "--out", str(out), "--workers", "1"]
+    with subprocess.Popen([sys.executable, "-m", "minisplat_ref", *words]) as process:
+        while not (out / phase).exists():
+            assert process.poll() is None
+            time.sleep(0.002)
+        process.kill()
+    assert not (out / "metrics.json").exists()
+    assert main(["train", "--resume", str(out), "--workers", "1"]) == 0
+    assert same_files(out, finished)
 
 
 @pytest.mark.parametrize(
