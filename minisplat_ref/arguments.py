@@ -4,7 +4,7 @@ import argparse
 import difflib
 import math
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
@@ -165,15 +165,22 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
     )
 
 
-def add_worker_arguments(parser: argparse.ArgumentParser, is_shown: bool = True) -> None:
-    """Add ``--workers`` and ``--cluster``, of which at most one may be given; the help may leave them out."""
-    here = "train in N processes at once (default 0: in turn)"
-    elsewhere = "train by the workers of a Dask scheduler, tcp://HOST:PORT"
-    if not is_shown:
-        here = elsewhere = argparse.SUPPRESS
+def add_worker_arguments(
+    parser: argparse.ArgumentParser,
+    here: str = "train in N processes at once (default 0: in turn)",
+    elsewhere: str = "train by the workers of a Dask scheduler, tcp://HOST:PORT",
+) -> None:
+    """Add ``--workers`` and ``--cluster``, of which at most one may be given, with these help texts."""
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--workers", type=integer(0), default=0, metavar="N", help=here)
     group.add_argument("--cluster", type=name, default=None, metavar="ADDRESS", help=elsewhere)
+
+
+def without_workers(words: Sequence[str]) -> list[str]:
+    """Return the words of a command without ``--workers N`` and ``--cluster ADDRESS``."""
+    options = ("--workers", "--cluster")
+    pairs = zip(("", *words), words, strict=False)
+    return [word for before, word in pairs if word.partition("=")[0] not in options and before not in options]
 
 
 def decibels(text: str) -> float:

@@ -234,6 +234,7 @@ def _run(argv: Sequence[str]) -> int:
     try:
         parser = _parser_of(argv)
         args = parser.parse_args(argv)
+        args.words = tuple(argv)
         if args.run is None:
             parser.print_help()
             return 0

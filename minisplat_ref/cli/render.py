@@ -12,14 +12,17 @@ from minisplat_ref.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
+    add_worker_arguments,
     color,
     integer,
     positive,
+    without_workers,
 )
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
+    from minisplat_ref.runs.cluster import Workers
     from minisplat_ref.runs.source import Source
 
 DESCRIPTION = """\
@@ -44,6 +47,7 @@ RUN_CAMERAS = ("test", "train", "all")
 LIST = "pictures.json"  # what a rendering has left in its folder, so that the next one can take it away
 ENDS = (".png", "_depth.png", "_depth.npy", "_albedo.png", "_metallic.png", "_roughness.png", "_normal.png")
 MAPS = ("albedo", "metallic", "roughness", "normal")
+PART = 25  # images that a worker renders before it is given others
 ORBIT_SIZE = (640, 480)  # pixels, where no run says otherwise
 
 
@@ -78,9 +82,11 @@ def add_parser(commands: Commands) -> None:
         "--size", type=_size, metavar="WxH", help="of an orbit's images (default: the run's, or 640x480)"
     )
     parser.add_argument(
-        "--film", type=Path, metavar="FILE", help="also make a film: .gif, or .mp4 with imageio[ffmpeg]"
+        "--film", type=Path, metavar="FILE", help="also a film: .gif, .mp4 (imageio[ffmpeg]); --fps F (25)"
     )
-    parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help="images a second (default 25)")
+    parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help=argparse.SUPPRESS)
+    add_worker_arguments(parser, "in N processes at once; --cluster ADDRESS: elsewhere", argparse.SUPPRESS)
+    parser.add_argument("--part", type=_part, help=argparse.SUPPRESS)  # A:B of the images, which a worker is told
     parser.add_argument(
         "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
@@ -95,11 +101,12 @@ def run(args: argparse.Namespace) -> int:
 
     from minisplat_ref import memory
     from minisplat_ref.io import write_image
-    from minisplat_ref.io.film import check_film, write_film
+    from minisplat_ref.io.film import check_film
     from minisplat_ref.io.names import file_names
     from minisplat_ref.mechanisms.gbuffer.maps import map_image
     from minisplat_ref.reference.depth import expected_depth
     from minisplat_ref.reports.images import depth_image, depth_range
+    from minisplat_ref.runs.cluster import Workers
     from minisplat_ref.runs.first_use import warn_if_not_kept
     from minisplat_ref.runs.notices import warn_of_model
     from minisplat_ref.runs.source import open_source
@@ -119,19 +126,24 @@ def run(args: argparse.Namespace) -> int:
     out: Path = args.out or source.beside("views")
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
     memory.check_render_size(largest.width, largest.height, args.depth)
-    if args.film is not None:
+    if args.film is not None and args.part is None:
         check_film(args.film, [(view.camera.width, view.camera.height) for view in views])
     names = file_names([view.name for view in views])
     wants = frozenset({"depth"} if args.depth else ()) | frozenset({args.map} if args.map else ())
     channels = _channels(args, source, wants)
+    part = slice(None) if args.part is None else slice(*args.part)
     outputs = (
         source.trained.render(view_from(view.camera, time=view.time if args.time is None else args.time), wants)
-        for view in views
+        for view in views[part]
     )
     first = next(outputs)  # what cannot be drawn is refused before the folder is touched
-    _make_room(out, names)
-    drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views), unit="view", disable=None)
-    for name, output in zip(names, drawn, strict=True):
+    if args.part is None:
+        _make_room(out, names)
+    workers = Workers(args.workers, args.cluster)
+    if workers.is_used:
+        return _hand_out(workers, args, out, names)
+    drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views[part]), unit="view", disable=None)
+    for name, output in zip(names[part], drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
             sums = output.image[..., channels["depth"].start]
@@ -141,11 +153,38 @@ def run(args: argparse.Namespace) -> int:
         if args.map:
             shown = map_image(args.map, output.image[..., channels[args.map]], output.alpha)
             write_image(out / f"{name}_{args.map}.png", shown)
-    print(f"{len(views)} images in {out}")
+    if args.part is None:
+        _finish(args, out, names)
+    return 0
+
+
+def _finish(args: argparse.Namespace, out: Path, names: Sequence[str]) -> None:
+    """Say what there is, and make the film of it."""
+    from minisplat_ref.io.film import write_film
+
+    print(f"{len(names)} images in {out}")
     if args.film is not None:
         write_film(args.film, [out / f"{name}.png" for name in names], args.fps)
         print(f"film: {args.film}")
-    return 0
+
+
+def _hand_out(workers: "Workers", args: argparse.Namespace, out: Path, names: Sequence[str]) -> int:
+    """Have the images rendered by workers, some by each command; return the exit code."""
+    from minisplat_ref.runs.cluster import carry_out_all
+    from minisplat_ref.runs.worker import Job
+
+    words = [*without_workers(args.words), "--out", str(out)]
+    parts = [f"{start}:{min(start + PART, len(names))}" for start in range(0, len(names), PART)]
+    jobs = [Job(f"images {part}", _words_of_part, (words, part)) for part in parts]
+    inputs = [path for path in (args.input, args.environment) if path is not None]
+    code = carry_out_all(workers, jobs, out, inputs)
+    if code == 0:
+        _finish(args, out, names)
+    return code
+
+
+def _words_of_part(words: Sequence[str], part: str) -> list[str]:
+    return [*words, "--part", part]
 
 
 def _channels(args: argparse.Namespace, source: "Source", wants: frozenset[str]) -> dict[str, slice]:
@@ -229,6 +268,13 @@ def _arc(text: str) -> float:
     if not 0 < degrees <= 360:
         raise argparse.ArgumentTypeError(f"{text!r} is not an angle above 0 and at most 360 degrees")
     return math.radians(degrees)
+
+
+def _part(text: str) -> tuple[int, int]:
+    start, _, stop = text.partition(":")
+    if not (start.isdecimal() and stop.isdecimal() and int(start) < int(stop)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a part of the images such as 0:25")
+    return int(start), int(stop)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,12 +1,15 @@
 """``study``: measures what a choice in a method does."""
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.arguments import Commands, HelpFormatter, Parser
+from minisplat_ref.arguments import Commands, HelpFormatter, Parser, add_worker_arguments, integer, without_workers
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
+    from minisplat_ref.runs.cluster import Workers
     from minisplat_ref.studies.study import Study
 
 DESCRIPTION = """\
@@ -58,8 +61,46 @@ def run(args: argparse.Namespace) -> int:
     study = studies[args.name]
     parser = Parser(prog=f"minisplat-ref study {args.name}", description=study.summary, formatter_class=HelpFormatter)
     study.add_arguments(parser)
+    if study.is_resumed:
+        add_worker_arguments(parser)
+        parser.add_argument("--job", type=integer(0), help=argparse.SUPPRESS)  # what a worker is told
     parser.epilog = _example(parser)
-    return study.run(parser.parse_args(args.arguments)) or 0
+    given = parser.parse_args(args.arguments)
+    if not study.is_resumed:
+        return study.run(given) or 0
+    return _run_resumed(study, given, args.words)
+
+
+def _run_resumed(study: "Study", given: argparse.Namespace, words: Sequence[str]) -> int:
+    """Run a study of several trainings here or by workers, or one of them for another process."""
+    from functools import partial
+
+    from minisplat_ref.runs.cluster import Workers
+    from minisplat_ref.studies.records import handing_out, one_job
+
+    if given.job is not None:
+        with one_job(given.job):
+            study.run(given)
+        return 0
+    workers = Workers(given.workers, given.cluster)
+    with handing_out(partial(_hand_out, workers, without_workers(words)) if workers.is_used else None):
+        return study.run(given) or 0
+
+
+def _hand_out(workers: "Workers", words: list[str], folder: Path, numbers: Sequence[int]) -> None:
+    from minisplat_ref.runs.cluster import carry_out_all
+    from minisplat_ref.runs.worker import Job
+
+    jobs = [Job(f"training {n + 1}", _words_of_job, (folder.resolve(), n, words)) for n in numbers]
+    code = carry_out_all(workers, jobs, folder, on_done=lambda job: print(f"{job.name}: ended", flush=True))
+    if code:
+        raise InputError(f"a training has failed; what others measured is in {folder}, and the same command continues")
+
+
+def _words_of_job(folder: Path, number: int, words: list[str]) -> list[str] | None:
+    from minisplat_ref.studies.records import job_file
+
+    return None if job_file(folder, number).exists() else [*words, "--job", str(number)]
 
 
 EXAMPLES = {"SCENE": "room", "FILE": "runs/mine.ply", "DIR": "study"}

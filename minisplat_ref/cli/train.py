@@ -98,7 +98,7 @@ def add_parser(commands: Commands) -> None:
         "--blocks", type=_shape, metavar="AxB", help="in A x B parts; at once: --workers N, --cluster ADDRESS"
     )
     parser.add_argument("--block", type=Path, metavar="PART", help=argparse.SUPPRESS)  # one of them
-    add_worker_arguments(parser, is_shown=False)
+    add_worker_arguments(parser, argparse.SUPPRESS, argparse.SUPPRESS)
     parser.add_argument("--view", nargs="?", type=integer(0), const=VIEWER_PORT, metavar="PORT", help=argparse.SUPPRESS)
 
     data = parser.add_argument_group("photographs")

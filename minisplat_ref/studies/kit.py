@@ -1,8 +1,8 @@
 """What studies are made of: a scene, trainings by seed, records that resume, and the report that is written.
 
 A study's module measures, draws and returns a :class:`Report`; :func:`carry_out` gives figures their style, and writes
-and prints the report. Trainings take long: with :func:`resume` a study stores the record of each as soon as it ends,
-and continues with the missing ones when it is called again with the same folder.
+and prints the report. Trainings take long: with :func:`.records.resume` a study stores the record of each as soon as it
+ends, and continues with the missing ones when it is called again with the same folder.
 
 Means over seeds, tables and curves are in :mod:`.figures`. Neither module loads Numba or matplotlib by itself, so that
 commands can use them.
@@ -26,6 +26,7 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.reporting import describe_machine
 from minisplat_ref.reports.palette import PNG_DPI
 from minisplat_ref.studies.figures import STYLE
+from minisplat_ref.studies.records import resume as resume
 from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.types import NOTHING, Camera, Floats, Gaussians, Scene
 
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from minisplat_ref.training.state import TrainState
 
 REMEDY = "give more iterations, larger photographs or another scene, with which it acts"
-RUNS = "runs.jsonl"  # what has been measured so far, below the settings
 Item = TypeVar("Item")
 
 
@@ -303,61 +303,6 @@ def read_run(ply: Path) -> tuple[Gaussians, Camera]:
     if not cameras or not len(gaussians.means):
         raise InputError(f"{ply} has no Gaussians, or its cameras.json no test views: give the PLY of a run")
     return gaussians, cameras[0]
-
-
-# Records
-
-
-def resume(
-    folder: Path,
-    settings: Mapping[str, Any],
-    jobs: Sequence[Mapping[str, Any]],
-    measure: Callable[..., Iterable[Mapping[str, Any]]],
-    warm_up: Callable[[list[Mapping[str, Any]]], None] = lambda missing: None,
-) -> list[dict[str, Any]]:
-    """Measure the jobs that have no record in the folder, and return all its records.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    settings : dict
-        On which all records depend.
-    jobs : sequence of dict
-        Keyword arguments of ``measure``, which a record has, too.
-    measure : callable
-        Returns the further entries of each record of a job.
-    warm_up : callable
-        Called with the missing jobs before the first, so that none counts the time of compiling.
-
-    Raises
-    ------
-    InputError
-        The folder belongs to other settings, or contains something else.
-    """
-    records = _read_records(folder, settings)
-    missing = [job for job in jobs if not any(job.items() <= record.items() for record in records)]
-    warm_up(missing)
-    for job in with_progress(missing, "trainings"):
-        for measured in measure(**job):
-            records.append({**job, **measured})
-            with open(folder / RUNS, "a", encoding="utf-8") as file:
-                file.write(json.dumps(records[-1]) + "\n")
-    return records
-
-
-def _read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    path = folder / RUNS
-    if not folder.exists():
-        folder.mkdir(parents=True)
-        path.write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        return []
-    if not path.is_file():
-        raise InputError(f"{folder} exists and is not of this study: give another --out")
-    first, *lines = path.read_text(encoding="utf-8").splitlines()
-    if json.loads(first) != settings:
-        raise InputError(f"{folder} holds trainings of {first}: give another --out, or the same settings")
-    return [json.loads(line) for line in lines]
 
 
 # Measurements

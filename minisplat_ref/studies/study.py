@@ -30,6 +30,8 @@ class Study(NamedTuple):
     """Adds the arguments to the parser, and a description where the summary is not enough; loads nothing heavy."""
     run: Callable[[argparse.Namespace], int | None]
     """Measures, writes, prints; returns the exit code, None for 0. Raises InputError for bad input."""
+    is_resumed: bool = False
+    """Whether it continues in its folder, by :func:`.records.resume`; then its jobs can be carried out by workers."""
 
 
 def declare(title: str, summary: str, function: str, *arguments: Argument, description: str | None = None) -> Study:
@@ -57,9 +59,10 @@ def declare(title: str, summary: str, function: str, *arguments: Argument, descr
         from minisplat_ref.studies.kit import carry_out
 
         module, _, measure = function.rpartition(".")
-        carry_out(getattr(import_module(module), measure), args, is_resumed=RESUMED_OUT in arguments)
+        carry_out(getattr(import_module(module), measure), args, is_resumed=is_resumed)
 
-    return Study(title, summary, add_arguments, run)
+    is_resumed = RESUMED_OUT in arguments
+    return Study(title, summary, add_arguments, run, is_resumed)
 
 
 def argument(*names: str, **settings: Any) -> Argument:

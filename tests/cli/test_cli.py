@@ -252,6 +252,28 @@ def test_render_from_a_camera_file_equals_the_run_s_own(run_folder, tmp_path):
     assert len(own) == N_TRAIN + N_TEST
 
 
+def test_render_by_workers_is_render(run_folder, tmp_path, monkeypatch, capsys):
+    """With commands carried out here in place of workers' processes."""
+    from minisplat_ref.cli import render
+    from minisplat_ref.runs import cluster
+
+    def carry_out_all(workers, jobs, folder, inputs):
+        assert workers.n == 2 and inputs == [run_folder]
+        assert [job.name for job in jobs] == ["images 0:4", "images 4:8"]
+        return max(main(job.choose(*job.arguments)) for job in jobs)
+
+    monkeypatch.setattr(cluster, "carry_out_all", carry_out_all)
+    monkeypatch.setattr(render, "PART", 4)
+    for name, workers in (("here", "0"), ("there", "2")):
+        film = tmp_path / f"{name}.gif"
+        options = ["--cameras", "orbit", "--frames", "8", "--size", "32x24", "--film", str(film)]
+        assert main(["render", str(run_folder), *options, "--out", str(tmp_path / name), "--workers", workers]) == 0
+    here, there = ({path.name: path.read_bytes() for path in (tmp_path / n).iterdir()} for n in ("here", "there"))
+    assert here == there and len(here) == 9
+    assert (tmp_path / "here.gif").read_bytes() == (tmp_path / "there.gif").read_bytes()
+    assert capsys.readouterr().out.count("8 images in") == 2
+
+
 def test_render_orbit_of_a_ply_beside_it(run_folder, tmp_path):
     ply = tmp_path / "thing.ply"
     ply.write_bytes((run_folder / "point_cloud.ply").read_bytes())

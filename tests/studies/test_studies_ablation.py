@@ -16,7 +16,7 @@ from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.studies import ablation, conditions, kit
-from minisplat_ref.studies.kit import RUNS
+from minisplat_ref.studies.records import RUNS
 from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.studies.variants import (
     DEVIATIONS,

@@ -12,7 +12,7 @@ from minisplat_ref.io.images import read_image
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.studies import adaptive, kit
 from minisplat_ref.studies.conditions import get_condition
-from minisplat_ref.studies.kit import RUNS
+from minisplat_ref.studies.records import RUNS
 from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.training.schedule import action_name, settings_of
 from scenes import make_gaussians
