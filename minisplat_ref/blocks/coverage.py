@@ -12,7 +12,7 @@ from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs.part import Plane
 from minisplat_ref.types import Bools, Floats, Frame, Ints, Model, Scene, View
 
-SHARE_MIN = 0.15  # of the pixels, from which on a photograph belongs to a block
+SHARE_MIN = 0.25  # of the pixels, from which on a photograph belongs to a block: VastGaussian's
 TRAIN_VIEWS_MIN = 2  # photographs without which nothing can be trained
 
 

@@ -67,5 +67,5 @@ def test_places_are_those_of_the_files():
 
 
 def test_a_block_without_photographs_is_refused():
-    with pytest.raises(InputError, match="block 1-0 has 0 photographs of which 15% show it, and training needs 2"):
+    with pytest.raises(InputError, match="block 1-0 has 0 photographs of which 25% show it, and training needs 2"):
         cover(screen(), scene_of(looking_at(-0.9), looking_at(-0.8)), PLANE, [LEFT, RIGHT])
