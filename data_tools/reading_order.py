@@ -166,10 +166,10 @@ ORDER = (
             ),
             Step(
                 ("mechanisms/features/", "extensions/style/"),
-                (),
+                (25,),
                 "features of images; a scene in the style of an image",
             ),
-            Step(("extensions/segment/",), (), "labels of Gaussians from masks of photographs, by a vote"),
+            Step(("extensions/segment/",), (25,), "labels of Gaussians from masks of photographs, by a vote"),
             Step(("extensions/satellite/",), (), "affine cameras of satellites, the sun's shadows, surface models"),
             Step(
                 ("mechanisms/cameras/", "extensions/lens/", "extensions/wave/"),
@@ -180,7 +180,7 @@ ORDER = (
     ),
     Part(
         "the application",
-        ("runs/", "comparison/", "studies/", "reports/", "cli/"),
+        ("runs/", "comparison/", "blocks/", "studies/", "reports/", "cli/"),
         (
             Step(
                 ("cli/train.py", "runs/settings.py", "runs/run_folder.py", "runs/run.py"),
@@ -188,7 +188,7 @@ ORDER = (
                 "from a command line to a run and its folder",
             ),
             Step(
-                ("comparison/", "studies/", "reports/"),
+                ("comparison/", "blocks/", "studies/", "reports/"),
                 (),
                 "recipes side by side; how a claim is measured; the page of a result",
             ),

@@ -153,6 +153,7 @@ notes = {
     "bench": "speed beside error",
     "comparison": "recipes side by side",
     "viewer": "a scene in the browser",
+    "blocks": "a large scene in parts",
     "runs": "a training and its folder",
     "warm_up": "kernels ahead of their use",
     "testing": "the oracle for other tests",

@@ -45,7 +45,7 @@ GREY = np.full((16, 24, 3), 100)
 
 @pytest.mark.skipif((ROOT / "PKG-INFO").exists(), reason="a source distribution has no stored notebooks")
 def test_every_notebook_is_here():
-    assert [path.name[:2] for path in STORED] == [f"{number:02}" for number in range(25)]
+    assert [path.name[:2] for path in STORED] == [f"{number:02}" for number in range(26)]
     assert [path.stem for path in STORED] == sorted(path.stem for path in FOLDER.glob("[0-9]*.py"))
 
 
