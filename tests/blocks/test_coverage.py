@@ -61,7 +61,7 @@ def test_places_are_those_of_the_files():
     # The same screen in a frame of half the unit, moved by 3: its x of the files is 3 + 0.5 x.
     moved = Plane(np.array([3.0, 0.0, 0.0]), PLANE.axes)
     frame = Frame((3.0, 0.0, 0.0), 0.5)
-    views = scene_of(looking_at(-0.9), looking_at(-0.8))
+    views = scene_of(looking_at(0.0), looking_at(-0.2))
     masks, _ = cover(screen(frame=frame), views, moved, [LEFT])
     np.testing.assert_array_equal(masks[0]["v0"], cover(screen(), views, PLANE, [LEFT]).masks[0]["v0"])
 
