@@ -11,6 +11,7 @@
     DIR/...                  an ordinary run folder, of the merged model
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ from minisplat_ref.blocks.coverage import Coarse, cover
 from minisplat_ref.blocks.grid import Block, divide, ground_plane
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.frames import return_camera
+from minisplat_ref.io.frames import return_camera, return_points
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.part import Part, Plane, box_from_json
@@ -35,6 +36,8 @@ COARSE = "coarse"
 COARSE_RECIPE = "3dgs-accel"  # its Gaussians are what every recipe can start from
 COARSE_PART = 4  # a quarter of the iterations of a training of the whole
 COARSE_ITERATIONS = 1000  # for recipes that decide their own length
+PIXEL_BYTES = 4  # of a photograph, three, and of its mask
+TRAINED_COPIES = 4  # parameters, gradients, two moments
 FRESH: dict[str, Any] = {"extension": None, "set": {}, "simplify": None, "scene_type": None}
 
 
@@ -72,6 +75,9 @@ class Planned(NamedTuple):
     n_photographs: int
     iterations: int
     """Of its training."""
+    megabytes: int
+    """Of its photographs with their masks, and of its first Gaussians while they are trained; what a process takes
+    anyway, and what Gaussians are added, comes on top."""
 
 
 class Plan(NamedTuple):
@@ -144,11 +150,30 @@ def make_plan(asked: Asked, scene: Scene) -> Plan:
         Part(plane, block.region, own).write(asked.blocks_folder / f"{block.name}.json")
     n_views, cooling = len(scene.train_views), recipe_of(asked.settings).cooling
     whole = asked.settings.iterations
-    planned = [
-        Planned(block, len(own), whole if cooling is not None else max(1, round(whole * len(own) / n_views)))
-        for block, own in zip(blocks, masks, strict=True)
-    ]
+    gaussians = coarse.model.gaussians
+    places = plane.coordinates(return_points(gaussians.means, frame))  # [N, 2]
+    planned = []
+    for block, own in zip(blocks, masks, strict=True):
+        n_iterations = whole if cooling is not None else max(1, round(whole * len(own) / n_views))
+        n_bytes = PIXEL_BYTES * sum(mask.size for mask in own.values())
+        share = np.count_nonzero(block.region.contains(places)) / len(places)
+        n_bytes += round(share * TRAINED_COPIES * sum(field.nbytes for field in gaussians))
+        planned.append(Planned(block, len(own), n_iterations, math.ceil(n_bytes / 1e6)))
     return Plan(plane, tuple(planned), trained)
+
+
+def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> str | None:
+    """Return a sentence if the largest blocks of so many workers of this machine do not fit beside each other."""
+    largest = sorted((planned.megabytes for planned in plan.blocks), reverse=True)[:n_workers]
+    if 1e6 * sum(largest) <= free_bytes:
+        return None
+    a, b = asked.shape
+    finer = f"{2 * a}x{b}" if a <= b else f"{a}x{2 * b}"
+    return (
+        f"the photographs and first Gaussians of {len(largest)} blocks take {sum(largest) / 1e3:.1f} GB, and"
+        f" {free_bytes / 1e9:.1f} GB are free: photographs will be read again and again; give fewer --workers, or begin"
+        f" again with a finer grid, such as --blocks {finer}"
+    )
 
 
 def save_plan(asked: Asked, plan: Plan) -> None:
@@ -181,6 +206,7 @@ def to_json(asked: Asked, plan: Plan) -> dict[str, Any]:
                 "cameras": planned.block.n_cameras,
                 "photographs": planned.n_photographs,
                 "iterations": planned.iterations,
+                "megabytes": planned.megabytes,
             }
             for planned in plan.blocks
         ],
@@ -211,7 +237,7 @@ def load_plan(folder: Path) -> Plan | None:
 def _planned(entry: dict[str, Any]) -> Planned:
     core, region = box_from_json(entry["core"]), box_from_json(entry["region"])
     block = Block(str(entry["name"]), core, region, int(entry["cameras"]))
-    return Planned(block, int(entry["photographs"]), int(entry["iterations"]))
+    return Planned(block, int(entry["photographs"]), int(entry["iterations"]), int(entry["megabytes"]))
 
 
 def describe(asked: Asked, plan: Plan) -> str:

@@ -4,6 +4,7 @@ The trainings are processes, in turn or by workers; plan and merge are done here
 disk, so that a run that was killed anywhere continues, and ends with the same bytes.
 """
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,9 +23,11 @@ from minisplat_ref.blocks.plan import (
     load_plan,
     make_plan,
     save_plan,
+    too_large,
 )
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.frames import return_camera, return_points
+from minisplat_ref.memory import free_bytes
 from minisplat_ref.runs.cluster import Workers, carry_out_all
 from minisplat_ref.runs.run_folder import has_begun
 from minisplat_ref.runs.settings import Settings, load_frame, load_model, load_photographs, recipe_of
@@ -92,6 +95,9 @@ def plan_blocks(asked: Asked) -> Plan:
 
 def train_blocks(asked: Asked, plan: Plan, workers: Workers) -> int:
     """Train all blocks to their ends; return the exit code."""
+    warning = too_large(asked, plan, max(workers.n, 1), free_bytes())
+    if workers.address is None and warning is not None:
+        print(f"minisplat-ref: {warning}", file=sys.stderr)
     return _train(asked, {planned.block.name: plan.settings_of(asked, planned) for planned in plan.blocks}, workers)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref.blocks import train as train_module
-from minisplat_ref.blocks.plan import load_asked, load_plan
+from minisplat_ref.blocks.plan import load_asked, load_plan, too_large
 from minisplat_ref.cli import main, train_blocks
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -150,6 +150,17 @@ def test_adaptive_decides_for_each_block(scene_folder, tmp_path, monkeypatch):
     steps = [read_json(out / "blocks" / name / "metrics.json")["iterations"] for name in ("0-0", "1-0")]
     metrics = read_json(out / "metrics.json")
     assert metrics["iterations"] == max(steps) < 6 and metrics["has_ended_early"]
+
+
+def test_memory_is_foreseen(finished):
+    asked, plan = load_asked(finished), load_plan(finished)
+    for planned in plan.blocks:  # at most 8 photographs of 32 x 24, and 120 Gaussians of 59 numbers, 4 times
+        assert planned.megabytes == 1
+    large = plan._replace(blocks=tuple(p._replace(megabytes=m) for p, m in zip(plan.blocks, (300, 500), strict=True)))
+    assert too_large(asked, large, 2, 800e6) is None and too_large(asked, large, 1, 500e6) is None
+    sentence = too_large(asked, large, 2, 799e6)
+    assert "2 blocks take 0.8 GB, and 0.8 GB are free" in sentence and "such as --blocks 2x2" in sentence
+    assert "1 blocks take 0.5 GB" in too_large(asked._replace(shape=(1, 2)), large, 1, 1e6)
 
 
 @pytest.mark.slow
