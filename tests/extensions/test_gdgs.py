@@ -88,6 +88,18 @@ def test_pairs_beyond_reach_do_not_count():
     assert value == 0 and not v.any()
 
 
+def test_of_a_crowd_every_kth_stands_for_the_others(monkeypatch):
+    """Ten points on a line, of which at most four are paired: every third, 3 apart, each pushed by its neighbours."""
+    monkeypatch.setattr("minisplat_ref.extensions.gdgs.reference.PAIRED_MAX", 4)
+    means = np.zeros((10, 3))
+    means[:, 0] = np.arange(10)
+    value, v = disperse(means, [np.arange(10)], 2.0)
+    few, v_few = disperse(means[::3], [np.arange(4)], 2.0)
+    assert value == few > 0
+    assert_allclose(v[::3], v_few, rtol=CLOSED_FORM)
+    assert np.flatnonzero(v[:, 0]).tolist() == [0, 3, 6, 9]
+
+
 def test_regions_by_hand():
     """A box of 4 x 2 x 1 with two regions along x: cubes of side 2, so one along y and z."""
     regions = regions_of(np.array([[0.0, 0, 0], [4, 2, 1]]), 2)

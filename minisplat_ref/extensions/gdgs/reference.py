@@ -11,6 +11,7 @@ from minisplat_ref.types import Floats, Ints
 
 SIDE_MIN = 1e-30  # world units: of a region, where all points lie in one place
 REACH = 3.0  # h: pairs further apart repel each other by less than a ninetieth
+PAIRED_MAX = 2048  # primitives of a region whose pairs are computed: at most 2 million pairs, some 200 MB
 
 
 class Weights(NamedTuple):
@@ -142,10 +143,13 @@ def disperse(means: Floats, members: list[Ints], h: float) -> tuple[float, Float
         L     = mean over regions of (1 / n) sum_{i<j} E_ij,   E_ij = exp(-|x_i - x_j|^2 / (2 h^2)) - exp(-REACH^2 / 2)
         v_x_i = -(1 / n) sum_j (x_i - x_j) / h^2 exp(...)
 
-    over the pairs within ``REACH`` h of each other, beyond which E would be negative.
+    over the pairs within ``REACH`` h of each other, beyond which E would be negative. In a region of more than
+    ``PAIRED_MAX`` every k-th stands for the others: pairs grow with the square, and where a few points lie far away, one
+    region holds almost everything.
     """
     v, value, floor = np.zeros(means.shape), 0.0, np.exp(-(REACH**2) / 2)
-    for rows in members:
+    for region in members:
+        rows = region[:: -(-len(region) // PAIRED_MAX)]
         x = means[rows]
         pairs = cKDTree(x).query_pairs(REACH * h, output_type="ndarray")
         apart = x[pairs[:, 0]] - x[pairs[:, 1]]
