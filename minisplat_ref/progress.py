@@ -9,8 +9,6 @@ import time
 from collections.abc import Iterable, Iterator, Sized
 from typing import Any, Protocol, Self, TypeVar, cast
 
-from tqdm import tqdm
-
 Item = TypeVar("Item")
 
 SILENT_SECONDS = 1.0  # in a terminal, before a step shows a bar
@@ -19,9 +17,6 @@ LOG_SECONDS = 30.0  # in a log, before the first line and between two
 
 class Bar(Protocol):
     """What a step does with its bar."""
-
-    total: float | None
-    """Number of things to do; None while it is not known. May be set."""
 
     def update(self, n: float = 1, /) -> Any:
         """Count ``n`` things as done."""
@@ -40,8 +35,7 @@ class _Log:
     """The same in lines; all that it writes ends with a line break."""
 
     def __init__(self, description: str, unit: str, total: float | None, is_bytes: bool) -> None:
-        self.total = total
-        self._description, self._unit, self._is_bytes = description, unit, is_bytes
+        self._description, self._unit, self._total, self._is_bytes = description, unit, total, is_bytes
         self._n: float = 0
         self._start = self._last = time.monotonic()
 
@@ -59,11 +53,11 @@ class _Log:
 
     def _line(self, seconds: float) -> str:
         """Return what has been done, in which time, and how long the rest takes at that rate."""
-        total = "" if self.total is None else f" of {self._number(self.total)}"
-        line = f"{self._description}: {self._number(self._n)}{total} {self._unit}, {_interval(seconds)} gone"
-        if self.total is None or not 0 < self._n < self.total:
+        total = "" if self._total is None else f" of {self._number(self._total)}"
+        line = f"{self._description}: {self._number(self._n)}{total}{self._unit}, {_interval(seconds)} gone"
+        if self._total is None or not 0 < self._n < self._total:
             return line
-        return f"{line}, about {_interval(seconds * (self.total / self._n - 1))} to go"
+        return f"{line}, about {_interval(seconds * (self._total / self._n - 1))} to go"
 
     def _number(self, n: float) -> str:
         return f"{n / 1e6:.1f}" if self._is_bytes else f"{n:,.0f}"
@@ -77,12 +71,12 @@ class _Log:
 
 def _interval(seconds: float) -> str:
     """Return minutes and seconds, with hours where there are some."""
-    return tqdm.format_interval(seconds)
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes:02d}:{rest:02d}"
 
 
-def progress_bar(
-    description: str, unit: str = "it", total: float | None = None, *, delay: float = SILENT_SECONDS
-) -> Bar:
+def progress_bar(description: str, unit: str = "", total: float | None = None, *, delay: float = SILENT_SECONDS) -> Bar:
     """Return the bar of a step that says itself how far it is; a context manager.
 
     Parameters
@@ -97,11 +91,14 @@ def progress_bar(
         Seconds before a terminal shows it.
     """
     is_bytes = unit == "MB"
+    unit = f" {unit}" if unit else ""
     if not sys.stderr.isatty():
         return _Log(description, unit, total, is_bytes)
-    unit, scale = ("B", True) if is_bytes else (f" {unit}", False)
+    from tqdm import tqdm
+
+    shown = "B" if is_bytes else unit or "it"
     bar: Any = tqdm(
-        desc=description, total=total, unit=unit, unit_scale=scale, delay=delay, leave=False, dynamic_ncols=True
+        desc=description, total=total, unit=shown, unit_scale=is_bytes, delay=delay, leave=False, dynamic_ncols=True
     )
     return cast(Bar, bar)
 
@@ -109,7 +106,7 @@ def progress_bar(
 def with_progress(
     items: Iterable[Item],
     description: str,
-    unit: str = "it",
+    unit: str = "",
     *,
     total: float | None = None,
     delay: float = SILENT_SECONDS,

@@ -17,6 +17,7 @@ from minisplat_ref.arguments import (
     positive,
 )
 from minisplat_ref.errors import InputError
+from minisplat_ref.progress import with_progress
 
 if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
@@ -91,7 +92,6 @@ def add_parser(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render every camera to a PNG; what an earlier rendering has left in the folder goes."""
     import numpy as np
-    from tqdm import tqdm
 
     from minisplat_ref import memory
     from minisplat_ref.io import write_image
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     )
     first = next(outputs)  # what cannot be drawn is refused before the folder is touched
     _make_room(out, names)
-    drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views), unit="view", disable=None)
+    drawn = with_progress(chain([first], outputs), "rendering", "views", total=len(views))
     for name, output in zip(names, drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
