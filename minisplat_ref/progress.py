@@ -31,6 +31,19 @@ class Bar(Protocol):
         """Remove the bar."""
 
 
+class Lines:
+    """A file for a bar of tqdm where stderr is a log: each state that it shows becomes a line."""
+
+    def write(self, text: str) -> None:
+        """Write a line without what moves a cursor."""
+        if shown := text.strip():
+            print(f"minisplat-ref: {shown}", file=sys.stderr)
+
+    def flush(self) -> None:
+        """Show the lines now."""
+        sys.stderr.flush()
+
+
 class _Log:
     """The same in lines; all that it writes ends with a line break."""
 

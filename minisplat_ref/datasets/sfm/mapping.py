@@ -62,7 +62,7 @@ def map_photographs(database: Path, images: Path, work: Path, features: str, n_p
         folder = work / mapper
         folder.mkdir(parents=True)
         pycolmap.set_random_seed(SEED)  # for parts that have no seed among their options
-        with progress_bar(f"{mapper} mapper", "photographs", n_photos) as bar:
+        with progress_bar(f"{mapper} mapper", "photographs", n_photos, delay=0.0) as bar:
             if mapper == "incremental":
                 options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
                 found = pycolmap.incremental_mapping(
