@@ -19,6 +19,8 @@ from minisplat_ref.errors import InputError
 
 HOST, PAGES = "https://raw.githubusercontent.com", "https://github.com"
 PHOTOS = "photos"  # folder of the photographs, where ``sfm`` finds them
+AS_MEASURED = ("--features", "standard")  # dense ones were not tried where a photograph found no place
+OPENCV = ("--camera-model", "OPENCV")
 
 
 class File(NamedTuple):
@@ -52,9 +54,8 @@ class DataSet(NamedTuple):
         return f"{PAGES}/{self.repository}/tree/{self.commit[:7]}"
 
 
-def _sfm(long_side: int, camera_model: str = "SIMPLE_RADIAL") -> tuple[str, ...]:
-    lens = () if camera_model == "SIMPLE_RADIAL" else ("--camera-model", camera_model)
-    return ("sfm", f"{{}}/{PHOTOS}", "--out", "{}/scene", "--long-side", str(long_side), *lens)
+def _sfm(long_side: int, *options: str) -> tuple[str, ...]:
+    return ("sfm", f"{{}}/{PHOTOS}", "--out", "{}/scene", "--long-side", str(long_side), *options)
 
 
 CATALOGUE = {
@@ -64,7 +65,7 @@ CATALOGUE = {
         "abe236ee00cf90cfca6e36e65c00435d5b21f50a",
         "NVIDIA Source Code License: for research and evaluation, not for commerce",
         "LICENSE.txt",
-        _sfm(1440, "OPENCV"),
+        _sfm(1440, *AS_MEASURED, *OPENCV),
     ),
     "banana": DataSet(
         "16 photographs of bananas on a carpet, 3008 x 2000",
@@ -72,7 +73,7 @@ CATALOGUE = {
         "2778294e4a73aec8f37747e0d2edfc4cb38b23a6",
         "MIT",
         "LICENSE",
-        _sfm(1536),
+        _sfm(1536, *AS_MEASURED),
     ),
     "brighton_beach": DataSet(
         "18 photographs of trees and a shore from straight above, 4000 x 2250",
@@ -80,7 +81,7 @@ CATALOGUE = {
         "9506a9bf09c9678b7d0b80b014af5b606c8a7255",
         "BSD-2-Clause",
         "LICENSE",
-        _sfm(1536, "OPENCV"),
+        _sfm(1536, *AS_MEASURED, *OPENCV),
     ),
     "snowmiku": DataSet(
         "97 photographs of a plush figure on a bed, 4032 x 3024",
@@ -88,7 +89,7 @@ CATALOGUE = {
         "70fedae4fe163642ef71489e7e445f21ec0783e2",
         "MIT, of the photographs; the figure shows a character of others",
         "LICENSE",
-        _sfm(1536, "OPENCV"),
+        _sfm(1536, *AS_MEASURED, *OPENCV),
     ),
     "lund": DataSet(
         "29 photographs of a street, walked along, 1024 x 768",
