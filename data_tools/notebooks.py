@@ -53,6 +53,7 @@ IMAGE_EXACT = 1.0
 IMAGE_ROUNDED = 0.6
 SQUARE = 8  # pixels
 
+WIDGET = "application/vnd.jupyter.widget-view+json"  # sliders, which nobody can move in a stored notebook
 Cell = Any  # nbformat's nodes are dictionaries whose keys are attributes, too
 Notebook = Any
 
@@ -111,6 +112,7 @@ def execute(text: Path) -> Notebook:
 def strip_notebook(notebook: Notebook, name: str) -> Notebook:
     """Return the notebook without what a second run would change; raises as :func:`execute` does."""
     notebook.metadata.pop("language_info", None)
+    notebook.metadata.pop("widgets", None)  # where ipywidgets is installed
     seen: dict[str, int] = {}
     for number, cell in enumerate(notebook.cells):
         seen[cell.source] = seen.get(cell.source, 0) + 1
@@ -119,7 +121,8 @@ def strip_notebook(notebook: Notebook, name: str) -> Notebook:
             continue
         cell.execution_count = None
         cell.metadata.pop("execution", None)
-        cell.outputs = [_strip_output(out) for out in cell.outputs if out.get("name") != "stderr"]
+        shown = [out for out in cell.outputs if out.get("name") != "stderr" and WIDGET not in out.get("data", {})]
+        cell.outputs = [_strip_output(out) for out in shown]
         for out in cell.outputs:
             size = len(_png(out))
             if size > PNG_MAX:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.io.atomic import replacing
@@ -32,6 +31,7 @@ from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.renderer import ComparedRenderer
+from minisplat_ref.progress import with_progress
 from minisplat_ref.reporting import describe_machine, markdown_table
 
 LEFT_OUT = ("loss", "statistics", "surface", "adam")  # stages that no fault changes
@@ -103,7 +103,7 @@ def measure() -> dict[str, object]:
         scenes = scenes_of(0, way)
         found = {
             (fault.what, fault.where): signature_of(faulty(fault, fault.size, way), scenes.values())
-            for fault in tqdm(FAULTS, desc=mode, leave=False, disable=None)
+            for fault in with_progress(FAULTS, mode, "faults")
         }
         content[mode] = rows_of(Table(tuple(scenes), found))
     return content
@@ -121,7 +121,7 @@ def judge(seed: int, dtype: str, names: Sequence[str]) -> list[list[str]]:
         way = WAYS[name]
         scenes, ranks, unseen, missed = scenes_of(seed, way), [], 0, []
         trials = [(fault, size) for fault in FAULTS for size in sizes_of(fault)]
-        for fault, size in tqdm(trials, desc=name, leave=False, disable=None):
+        for fault, size in with_progress(trials, name, "trials"):
             found = signature_of(faulty(fault, size, way, dtype), scenes.values())
             ranked = [one.what for one in likeliest(found, list(scenes), is_fed=way.is_fed, n=len(FAULTS))]
             if not ranked:

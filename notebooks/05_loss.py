@@ -30,7 +30,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
-from figures import BLUE, GREY, RED, YELLOW, show, show_code, show_error
+from figures import BLUE, GREY, RED, YELLOW, show, show_code, show_error, with_sliders
 from minisplat_ref.constants import SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.metrics import psnr
@@ -119,9 +119,10 @@ changed[45, 60] = 1 - changed[45, 60]  # one pixel
 footprint = np.abs(ssim_map(changed, photo) - 1).max(axis=2) > 1e-12
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.1), width_ratios=[1, 1.2, 1.2])
+figure.get_layout_engine().set(w_pad=0.12)  # inches: else the first label is cut off
 shown = axes[0].imshow(window[8:23, 8:23], cmap="magma", extent=(7.5, 22.5, 22.5, 7.5))
 axes[0].add_patch(Rectangle((9.5, 9.5), 11, 11, fill=False, edgecolor="white"))
-axes[0].set(title="the window, measured; frame: 11 x 11", xlabel="column", ylabel="row")
+axes[0].set(title="the window, measured; frame: 11 x 11", xlabel="column", ylabel="row", xticks=range(8, 23, 2))
 figure.colorbar(shown, ax=axes[0], shrink=0.85)
 offsets = np.arange(-7, 8)
 axes[1].bar(offsets, window.sum(axis=0)[8:23], color=BLUE, label="measured")
@@ -271,27 +272,43 @@ print(
 #
 # ## Play
 #
-# Make an error of your own and compare. What to look for:
+# Mix an error of your own, with the sliders that a running notebook has below the picture, or by the first numbers of
+# the last lines. What to look for:
 #
-# * `my_image`: try `photo**1.2`, `np.flipud(photo)`, `np.round(photo * 4) / 4`, or `photo + 0.03 * np.sin(x)`.
-# * `w`: at which weight do the two terms pull equally hard, that is, when are the two printed sizes equal?
+# * `brighter` against `noise`: which of the two does SSIM forgive, at the same L1?
+# * `stripes` and `blur`: an error where the picture is smooth, and one where it is not.
+# * `w`: at which weight do the two terms pull equally hard, that is, when are the two sizes in the title equal?
+# * Other errors: in `mixed`, try `photo**1.2`, `np.flipud(photo)` or `np.round(photo * 4) / 4`.
 
 # %%
 x = np.arange(photo.shape[1])[None, :, None]
-my_image = np.clip(photo + 0.03 * np.sin(x), 0, 1)
-w = 0.2
+grain = np.random.default_rng(1).normal(size=photo.shape)
 
-sizes = [
-    part * np.abs(photometric_loss_vjp(photometric_loss(my_image, photo, weight)[1])).sum()
-    for part, weight in ((1 - w, 0.0), (w, 1.0))
-]
-figure, axes = plt.subplots(1, 3, figsize=(11, 2.6))
-show(axes[0], my_image, f"yours, PSNR {psnr(my_image, photo):.1f} dB")
-my_l1, my_dssim = (photometric_loss(my_image, photo, weight)[0] for weight in (0.0, 1.0))
-show_error(axes[1], my_image, photo, f"L1 {my_l1:.3f}", vmax=0.15)
-show(axes[2], 1 - ssim_map(my_image, photo).mean(axis=2), f"1 - SSIM {my_dssim:.3f}", cmap="magma", vmin=0, vmax=0.5)
-plt.show()
-print(f"size of the gradient: (1 - w) L1 {sizes[0]:.2f}, w (1 - SSIM) {sizes[1]:.2f}")
+
+def mixed(brighter, stripes, blur, noise, w):
+    """Draw the photograph with four errors at once, and both terms of the loss."""
+    blurred = gaussian_filter(photo, (blur, blur, 0), mode="nearest")
+    mine = np.clip(blurred + brighter + stripes * np.sin(x) + noise * grain, 0, 1)
+    l1, dssim = (photometric_loss(mine, photo, weight) for weight in (0.0, 1.0))  # values with tapes
+    sizes = [
+        part * np.abs(photometric_loss_vjp(tape)).sum() for part, (_, tape) in zip((1 - w, w), (l1, dssim), strict=True)
+    ]
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3))
+    figure.suptitle(f"size of the gradient: (1 - w) L1 {sizes[0]:.2f}, w (1 - SSIM) {sizes[1]:.2f}", fontsize=9.5)
+    show(axes[0], mine, f"yours, PSNR {psnr(mine, photo):.1f} dB")
+    show_error(axes[1], mine, photo, f"L1 {l1[0]:.3f}", vmax=0.15)
+    show(axes[2], 1 - ssim_map(mine, photo).mean(axis=2), f"1 - SSIM {dssim[0]:.3f}", cmap="magma", vmin=0, vmax=0.5)
+    return figure
+
+
+with_sliders(
+    mixed,
+    brighter=(0.0, -0.2, 0.2),  # the first value, the least, the most
+    stripes=(0.03, 0.0, 0.2),
+    blur=(0.0, 0.0, 3.0),
+    noise=(0.0, 0.0, 0.2),
+    w=(0.2, 0.0, 1.0),
+)
 
 # %% [markdown]
 # ## Exercises

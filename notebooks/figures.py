@@ -14,6 +14,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython import get_ipython
+from IPython.display import display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -82,6 +83,45 @@ def show_pixels(axes: Axes, image: np.ndarray, title: str = "", **style: Any) ->
 def show_error(axes: Axes, image: np.ndarray, truth: np.ndarray, title: str = "error", vmax: float = 0.3) -> AxesImage:
     """Show the mean absolute difference of two images over their channels."""
     return show(axes, np.abs(image - truth).mean(axis=2), title, cmap="magma", vmin=0, vmax=vmax)
+
+
+def with_sliders(draw: Callable[..., Figure], **ranges: tuple[float, float, float]) -> None:
+    """Show a figure, and below it a slider for each of its parameters, which draws it again in its place.
+
+    What is shown first is an ordinary picture, which stays where nothing runs. Sliders need ipywidgets, of the extra
+    ``notebooks``.
+
+    Parameters
+    ----------
+    draw : callable
+        Makes the figure from the parameters, by name.
+    **ranges
+        For each parameter its first value, the least and the most.
+    """
+
+    def drawn(**values: float) -> Figure:
+        figure = draw(**values)
+        plt.close(figure)  # which would show it a second time
+        return figure
+
+    shown = display(drawn(**{name: first for name, (first, _, _) in ranges.items()}), display_id=True)
+    try:
+        import ipywidgets
+    except ImportError:
+        return
+    sliders = {
+        name: ipywidgets.FloatSlider(
+            value=first, min=least, max=most, step=(most - least) / 40, description=name, continuous_update=False
+        )
+        for name, (first, least, most) in ranges.items()
+    }
+
+    def redraw(_: Any) -> None:
+        shown.update(drawn(**{name: slider.value for name, slider in sliders.items()}))
+
+    for slider in sliders.values():
+        slider.observe(redraw, names="value")
+    display(ipywidgets.VBox(list(sliders.values())))
 
 
 def covariances2d(projection: Projection) -> np.ndarray:

@@ -29,6 +29,7 @@ from . import (
     cache,
     compare,
     convert,
+    data,
     demo,
     downscale,
     evaluate,
@@ -49,7 +50,7 @@ from . import (
 
 GROUPS = {
     "start here": (demo, photos),
-    "preparing scenes": (sfm, undistort, downscale, synthetic),
+    "preparing scenes": (data, sfm, undistort, downscale, synthetic),
     "training and its results": (train, view, render, evaluate, simplify, mesh, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
     "the program itself": (extensions, cache),

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from minisplat_ref.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.progress import with_progress
 
 SCENE = {"n_views": 28, "width": 192, "height": 144, "n_points": 8000, "seed": 0, "test_every": 8}
 RECIPE = "3dgs-accel"
@@ -47,8 +48,6 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene, train, write the report, and say where it is."""
-    from tqdm import tqdm
-
     from minisplat_ref.constants import GSPLAT_MAIN
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import write_scene
@@ -64,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     folder = args.out or _first_free(Path(DEFAULT_OUT))
     run_folder.check_free(folder)
-    synthetic = make_scene("room", **SCENE, progress=partial(tqdm, desc="ray-tracing", unit="view"))
+    synthetic = make_scene("room", **SCENE, progress=partial(with_progress, description="ray-tracing", unit="views"))
     write_scene(synthetic, folder / "scene", {"scene": "room", **SCENE})
     settings = Settings(
         scene=str((folder / "scene").resolve()),

@@ -33,7 +33,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "photos",
-        help="your photographs: cameras, training, film and report in one",
+        help="your photographs: cameras, training, film and report",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,

@@ -19,6 +19,7 @@ from minisplat_ref.arguments import (
     without_workers,
 )
 from minisplat_ref.errors import InputError
+from minisplat_ref.progress import with_progress
 
 if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
@@ -97,7 +98,6 @@ def add_parser(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render every camera to a PNG; what an earlier rendering has left in the folder goes."""
     import numpy as np
-    from tqdm import tqdm
 
     from minisplat_ref import memory
     from minisplat_ref.io import write_image
@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> int:
     workers = Workers(args.workers, args.cluster)
     if workers.is_used:
         return _hand_out(workers, args, out, names)
-    drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views[part]), unit="view", disable=None)
+    drawn = with_progress(chain([first], outputs), "rendering", "views", total=len(views[part]))
     for name, output in zip(names[part], drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:

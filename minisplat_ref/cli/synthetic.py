@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from minisplat_ref.arguments import SYNTHETIC_SCENES, Commands, HelpFormatter
+from minisplat_ref.progress import with_progress
 
 DESCRIPTION = """\
 Ray-trace photographs of a small world, and write them as a COLMAP scene with
@@ -69,8 +70,6 @@ def run(args: argparse.Namespace) -> int:
     """Trace the scene, write it, and say what it holds."""
     from functools import partial
 
-    from tqdm import tqdm
-
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import check_free, write_scene
     from minisplat_ref.datasets.synthetic.triangles import triangulate_world
@@ -88,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         "test_every": args.test_every,
     }
     check_free(args.out)
-    progress = partial(tqdm, desc="ray-tracing", unit=" views", leave=False)
+    progress = partial(with_progress, description="ray-tracing", unit="views")
     synthetic = make_scene(args.name, **settings, progress=progress)
     triangles = triangulate_world(synthetic.world)
     mesh = ColoredMesh(triangles.vertices, triangles.faces, triangles.colors)

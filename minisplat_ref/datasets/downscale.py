@@ -6,12 +6,11 @@ are rounded; colours pass through the same LANCZOS filter as on the fly.
 
 from pathlib import Path
 
-from tqdm import tqdm
-
 from minisplat_ref.datasets.photo_files import list_images
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import downscaled_size, read_image, resize_image, write_image
+from minisplat_ref.progress import with_progress
 
 
 def downscale_images(images: Path, factor: int) -> Path:
@@ -39,7 +38,7 @@ def downscale_images(images: Path, factor: int) -> Path:
     files = list_images(images)
     target = images.with_name(f"{images.name}_{factor}")
     with making_folder(target) as folder:
-        for file in tqdm(files, desc=target.name, unit=" images", leave=False, disable=None):
+        for file in with_progress(files, target.name, "photographs"):
             image = read_image(file)
             small = folder / file.relative_to(images)
             small.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
@@ -25,6 +24,7 @@ from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
 from minisplat_ref.io.transforms import find_frames, find_points, find_transforms, read_transforms
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Camera
 
 # What a transforms.json says about lenses; every frame gets its pinhole's entries instead.
@@ -96,7 +96,7 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
         shutil.move(Path(temporary, "images"), out / "images")
         shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")
     reading = build_reading(1, None, undistort=True, alpha_is_mask=True)
-    for photo in tqdm(photos, desc="masks", unit=" images", leave=False, disable=None):
+    for photo in with_progress(photos, "undistorting", "masks"):
         # COLMAP does not write every format that the loader reads (not WebP), and does not say so.
         is_missing = not (out / "images" / photo.file).is_file()
         if is_missing or _has_mask(photo):
@@ -154,7 +154,7 @@ def _undistort_frames(
     """Write the images and masks of one file's frames under their names, its points, and the file."""
     reading = build_reading(1, None, undistort=True, alpha_is_mask=False)
     copies = []
-    for frame, photo, name in tqdm(frames, desc="images", unit=" images", leave=False, disable=None):
+    for frame, photo, name in with_progress(frames, "undistorting", "photographs"):
         view = read_view(photo, photo.file, reading)
         entries = {"file_path": name.as_posix(), **_intrinsics(view.camera)}
         _write(folder / name, view.image)

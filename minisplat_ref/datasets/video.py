@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from tqdm import tqdm
 
 from minisplat_ref.constants import LUMA
 from minisplat_ref.errors import InputError, one_line
 from minisplat_ref.io.images import DAMAGE_ERRORS, write_image
+from minisplat_ref.progress import with_progress
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".gif")
 SECONDS = 0.5  # of a video, from which one frame is kept
@@ -48,7 +48,7 @@ def keep_sharpest(video: Path, folder: Path, every: int | None = None) -> list[P
     kept: list[Path] = []
     best: tuple[float, int, NDArray[np.uint8]] | None = None
     frames, every = _read(video, every)
-    for i, frame in enumerate(tqdm(frames, desc="frames", unit=" frames", leave=False, disable=None)):
+    for i, frame in enumerate(with_progress(frames, "reading the video", "frames")):
         value = sharpness(frame)
         if best is None or value > best[0]:
             best = value, i, frame

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError, InputWarning, one_line
@@ -35,12 +34,12 @@ from minisplat_ref.io.images import (
 from minisplat_ref.io.lens import Lens, optics_of, pinhole_of, undistort
 from minisplat_ref.io.names import is_file
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 COORDINATE_MAX = 1e18  # world units or pixels; the square of more would overflow float32
 DARK = 64  # of 255: a scene whose brightest pixel is below is stored in the wrong range; 14 bits of 16 reach 63
-SILENT_SECONDS = 2.0  # before reading photographs shows a progress bar
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
 
 
@@ -220,9 +219,9 @@ def _warn_of_darkness(source: Path, views: Sequence[View]) -> None:
 
 
 def _show_progress(photos: Sequence[Photo], names: Sequence[str]) -> Iterable[tuple[Photo, str]]:
-    """Return photographs with their names, with a progress bar on a terminal if reading takes a while."""
+    """Return photographs with their names, with a progress bar if reading takes a while."""
     pairs = list(zip(photos, names, strict=True))
-    return tqdm(pairs, desc="photographs", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
+    return with_progress(pairs, "reading", "photographs")
 
 
 def _n_pixels(photo: Photo) -> int:

@@ -34,6 +34,7 @@ from minisplat_ref.oracle.tolerances import (
     GRADIENT_REL_NEAR_THRESHOLD,
     PEER_REL,
 )
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Floats
 
 AUTOGRAD = "torch autograd"
@@ -92,12 +93,15 @@ def check_gradients(backend: Backend, conventions: Conventions) -> Report:
     """
     rng = np.random.default_rng(SEED)
     tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
-    cases = [jacobian_case(stage) for stage in backend_stages(backend, tiny, rng)]
+    own = f"{backend.name}, Jacobians"
+    cases = [jacobian_case(stage) for stage in with_progress(backend_stages(backend, tiny, rng), own, "stages")]
     if backend is REFERENCE:
         done = {case.name for case in cases}
         pieces = [stage for module, pieces_of in PIECES.items() for stage in pieces_of(module)]
-        cases += [jacobian_case(stage) for stage in pieces if f"{stage.name}: Jacobian" not in done]
-    cases += [inner_product_case(stage, rng) for stage in backend_stages(backend, larger, rng)]
+        left = [stage for stage in pieces if f"{stage.name}: Jacobian" not in done]
+        cases += [jacobian_case(stage) for stage in with_progress(left, own, "formulas")]
+    stages = with_progress(backend_stages(backend, larger, rng), f"{backend.name}, inner products", "stages")
+    cases += [inner_product_case(stage, rng) for stage in stages]
     cases += public_call_cases(backend, conventions)
     settings = {"backend": backend.name, "profile": conventions.name, "dtype": "float64", "seed": SEED}
     try:
@@ -113,7 +117,8 @@ def public_call_cases(backend: Backend, conventions: Conventions) -> list[Case]:
     rng = np.random.default_rng(SEED)
     tiny, larger = tiny_setting(conventions), make_setting(rng, 20, 20, 15, conventions, sh_degree=3)
     cases = [jacobian_case(rasterization_stage(backend, tiny, Call("ED"), rng, n_cameras=1))]
-    cases += [inner_product_case(rasterization_stage(backend, larger, call, rng), rng) for call in CALLS]
+    calls = with_progress(CALLS, f"{backend.name}, rasterization", "modes")
+    cases += [inner_product_case(rasterization_stage(backend, larger, call, rng), rng) for call in calls]
     return cases
 
 

@@ -23,6 +23,7 @@ from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.oracle.setting import POSE, Setting, make_setting
 from minisplat_ref.oracle.stages import Stage, watch
+from minisplat_ref.progress import with_progress
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
@@ -76,8 +77,10 @@ def model_cases(
         names = {stage.name for stage in further}
         return (*(stage for stage in whole if stage.name not in names), *further)
 
-    cases: list[Case] = [jacobian_case(stage) for stage in all_stages(tiny)]
-    return cases + [inner_product_case(stage, rng) for stage in all_stages(larger)]
+    checked = with_progress(all_stages(tiny), f"{backend.name}, Jacobians", "stages")
+    cases: list[Case] = [jacobian_case(stage) for stage in checked]
+    checked = with_progress(all_stages(larger), f"{backend.name}, inner products", "stages")
+    return cases + [inner_product_case(stage, rng) for stage in checked]
 
 
 def model_stage(backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator) -> Stage:

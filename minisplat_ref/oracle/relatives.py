@@ -18,6 +18,7 @@ from minisplat_ref.oracle.gradients import by_backend
 from minisplat_ref.oracle.loss_terms import loss_cases, own_terms
 from minisplat_ref.oracle.models import TIME, Stages, model_cases
 from minisplat_ref.oracle.pieces import SEED
+from minisplat_ref.progress import with_progress
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import Recipe
@@ -70,7 +71,9 @@ def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> li
             cases += model_cases(backend, conventions, calibrated, None)
     core = [term for recipe in RECIPES.values() for term in recipe.losses]
     terms = own_terms([*relative.losses, *(term for recipe in relative.recipes for term in recipe.losses)], core)
-    return cases + [case for term in terms for case in loss_cases(term, backend, conventions, relative.representation)]
+    for term in with_progress(terms, f"{backend.name}, losses", "terms"):
+        cases += loss_cases(term, backend, conventions, relative.representation)
+    return cases
 
 
 def _with_calibrations(representation: Representation, recipe: Recipe) -> Representation:

@@ -4,12 +4,10 @@ The cameras render the run; photographs are not needed. A first pass over them f
 how large the grid has to be; a second fuses the depths (:mod:`minisplat_ref.mechanisms.fusion`).
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
@@ -20,6 +18,7 @@ from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest, marching_cubes_package
 from minisplat_ref.mechanisms.fusion.kernels import fuse
 from minisplat_ref.mechanisms.fusion.volume import BOUND, Contraction, DepthMap, Grid, empty_volume
+from minisplat_ref.progress import with_progress
 from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.depth_maps import DepthKind, depth_map
@@ -107,7 +106,7 @@ def mesh_run(opened: Opened, asked: Asked) -> Meshed:
     grid = _choose_grid(opened, places, asked)
     volume = empty_volume(grid)
     truncation = TRUNCATION * grid.voxel * (1.0 if grid.contraction is None else grid.contraction.radius)
-    for view in _bar(opened.views, "fusing"):
+    for view in with_progress(opened.views, "fusing depths", "views"):
         fuse(volume, grid, opened.camera_of(view), opened.map_of(view, asked.depth), truncation)
     try:
         whole = extract(volume, grid, asked.min_views)
@@ -132,7 +131,7 @@ class _Places(NamedTuple):
 def _find_surface(opened: Opened, kind: DepthKind) -> _Places:
     points: list[Floats] = [np.zeros((0, 3))]
     footprints: list[Floats] = [np.zeros(0)]
-    for view in _bar(opened.views, "looking"):
+    for view in with_progress(opened.views, "looking for the surface", "views"):
         depth, camera = opened.map_of(view, kind).depth, opened.camera_of(view)
         ids = np.flatnonzero(depth > 0)
         ids = ids[:: max(1, -(-len(ids) // POINTS_PER_VIEW))]
@@ -164,7 +163,3 @@ def _choose_grid(opened: Opened, places: _Places, asked: Asked) -> Grid:
     x, y, z = (low - MARGIN * voxel).tolist()
     n_x, n_y, n_z = (np.ceil((high - low) / voxel).astype(int) + 2 * MARGIN + 1).tolist()
     return Grid((x, y, z), voxel, (n_x, n_y, n_z))
-
-
-def _bar(views: Sequence[Viewpoint], description: str) -> "tqdm[Viewpoint]":
-    return tqdm(views, desc=description, unit="view", leave=False, dynamic_ncols=True, disable=None)

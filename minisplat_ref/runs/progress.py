@@ -15,6 +15,7 @@ from tqdm import tqdm
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing, unwritable
 from minisplat_ref.metrics import psnr
+from minisplat_ref.progress import LOG_SECONDS, Lines
 from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.state import StepReport
 
@@ -22,7 +23,6 @@ LOG_EVERY = 5  # iterations; a PSNR is measured as often
 PSNR_WINDOW = 20  # measured views that the shown PSNR is the mean of: single views differ too much to show a trend
 PSNR_MAX = 100.0  # dB; equal images have an infinite one, which JSON cannot hold
 BAR_SECONDS = 0.3  # between redraws of the bar
-PLAIN_SECONDS = 30.0  # likewise where stderr is a file, in which every redraw is a line
 
 
 class Clock(NamedTuple):
@@ -54,7 +54,8 @@ class Progress(AbstractContextManager["Progress"]):
             desc="compiling on first use",
             unit="it",
             dynamic_ncols=True,
-            mininterval=BAR_SECONDS if sys.stderr.isatty() else PLAIN_SECONDS,
+            mininterval=BAR_SECONDS if sys.stderr.isatty() else LOG_SECONDS,
+            file=None if sys.stderr.isatty() else Lines(),
         )
         self._start, self._cpu_start = time.perf_counter(), time.process_time()
         return self

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputWarning, one_line
@@ -16,6 +14,7 @@ from minisplat_ref.io.atomic import replacing_folder
 from minisplat_ref.io.names import file_names
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.rendering import Renderer, RenderSettings, Request
 from minisplat_ref.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.runs.checkpoints import newest_model
@@ -113,7 +112,7 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     stems = dict(zip(names, file_names(names), strict=True))
     with (
         replacing_folder(folder / RENDERS) as renders,
-        tqdm(total=len(names), desc="measuring", unit="view", delay=2.0, leave=False, disable=None) as bar,
+        progress_bar("measuring", "views", len(names)) as bar,
     ):
 
         def save(view: View, image: Floats, _: ViewMetrics) -> None:

@@ -30,12 +30,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE
 from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import ViewMetrics, evaluate
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.runs.model_file import label_for
 from minisplat_ref.runs.opened_run import Run, check_renderer, check_views
 from minisplat_ref.runs.rate_distortion import PlySize, Point, next_size, paired_drop, smallest_within
@@ -305,7 +305,7 @@ def cross_validate(run: Run, gaussians: Any, iterations: int) -> list[ViewMetric
     """Return the metrics of every training view, each of a copy of the Gaussians that was fine-tuned without it."""
     views, every_row = run.scene.train_views, np.arange(n_rows(gaussians))
     measured: dict[int, ViewMetrics] = {}
-    with _bar(f"measuring {len(every_row):,} Gaussians", len(run.folds) * iterations) as bar:
+    with progress_bar(f"measuring {len(every_row):,} Gaussians", "iterations", len(run.folds) * iterations) as bar:
         for fold in run.folds:
             copy = take(gaussians, every_row)
             model = fine_tune(run, copy, iterations, views=fold.trained, on_step=bar.update)
@@ -318,9 +318,5 @@ def finish(run: Run, n: int, iterations: int) -> Model:
     """Return ``n`` Gaussians in place of the run's, reduced and fine-tuned by all training views."""
     views = run.scene.train_views
     smaller = reduce(run, blend_weights(run), n)
-    with _bar(f"fine-tuning {n:,} Gaussians", iterations) as bar:
+    with progress_bar(f"fine-tuning {n:,} Gaussians", "iterations", iterations) as bar:
         return fine_tune(run, smaller, iterations, views=range(len(views)), on_step=bar.update)
-
-
-def _bar(description: str, total: int) -> "tqdm[Any]":
-    return tqdm(total=total, desc=description, leave=False, unit="it", dynamic_ncols=True, disable=None)

@@ -14,15 +14,16 @@ import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_ply, load_scene, viewpoints
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.progress import progress_bar
+from minisplat_ref.progress import with_progress as with_progress  # which studies take from here
 from minisplat_ref.reporting import describe_machine
 from minisplat_ref.reports.palette import PNG_DPI
 from minisplat_ref.studies.figures import STYLE
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from minisplat_ref.training.state import TrainState
 
 REMEDY = "give more iterations, larger photographs or another scene, with which it acts"
-Item = TypeVar("Item")
 
 
 class Report(NamedTuple):
@@ -158,12 +158,6 @@ def seeds_of(args: argparse.Namespace) -> str:
     return f"seeds {', '.join(map(str, args.seeds))}"
 
 
-def with_progress(items: Iterable[Item], description: str) -> Iterable[Item]:
-    """Return an iterable that shows a progress bar while it is consumed; none is shown outside a terminal."""
-    bar: Iterable[Item] = tqdm(items, desc=description, leave=False, disable=None)
-    return bar
-
-
 # Scenes and trainings
 
 
@@ -243,7 +237,7 @@ def train_with_progress(scene: Scene, recipe: "Recipe", seed: int, **arguments: 
     """Train with a progress bar; other arguments as for :func:`~minisplat_ref.training.loop.train`."""
     from minisplat_ref.training.loop import train
 
-    with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False, disable=None) as bar:
+    with progress_bar(f"{recipe.name}, seed {seed}", "iterations", recipe.iterations) as bar:
         return train(scene, recipe, seed=seed, on_step=lambda _: bar.update(), **arguments)
 
 

@@ -12,10 +12,9 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tqdm import tqdm
-
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.progress import with_progress
 
 RUNS = "runs.jsonl"  # what has been measured so far, below the settings
 
@@ -95,7 +94,7 @@ def resume(
         hand_out(folder, missing)
         return records + _take_in(folder, missing, jobs)
     warm_up([jobs[number] for number in missing])
-    for number in tqdm(missing, desc="trainings", leave=False, disable=None):
+    for number in with_progress(missing, "trainings"):
         job = jobs[number]
         for measured in measure(**job):
             records.append({**job, **measured})

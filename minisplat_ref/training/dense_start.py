@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from minisplat_ref.io.images import resize_image, resize_mask
-from minisplat_ref.io.scene import SILENT_SECONDS, rescale_camera
+from minisplat_ref.io.scene import rescale_camera
+from minisplat_ref.progress import with_progress
 from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.strategy.line_of_sight import MARGIN
 from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes
@@ -73,7 +73,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
     smalls = [_shrink(view.load(), scene) for view in views]
     neighbours = choose_neighbours(views, scene.points)
     jobs = list(zip(smalls, neighbours, strict=True))
-    progress = tqdm(jobs, desc="stereo", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
+    progress = with_progress(jobs, "stereo", "photographs")
     maps = [_sweep(small, [smalls[k].gray_view for k in near]) for small, near in progress]
     points, colors, spacings = scene.points, scene.point_colors, np.full(len(scene.points), np.inf)
     for small, own, near in zip(smalls, maps, neighbours, strict=True):

@@ -4,6 +4,8 @@ import ast
 import base64
 import io
 import re
+import sys
+from types import SimpleNamespace
 
 import jupytext
 import nbformat
@@ -150,6 +152,57 @@ def test_what_changes_is_stripped():
     assert cell.execution_count is None and cell.outputs[1].execution_count is None
     assert "execution" not in cell.metadata and "language_info" not in notebook.metadata
     assert list(cell.outputs[2].data) == ["image/png"]
+
+
+def test_sliders_are_not_stored():
+    sliders = nbformat.v4.new_output("display_data", {notebooks.WIDGET: {"model_id": "1"}, "text/plain": "VBox()"})
+    notebook = notebook_of(image(GREY), sliders)
+    notebook.metadata["widgets"] = {"state": {}}
+    [cell] = strip_notebook(notebook, "x").cells
+    assert [list(out.data) for out in cell.outputs] == [["image/png"]] and "widgets" not in notebook.metadata
+
+
+class Slider:
+    """What a slider of ipywidgets does without a browser."""
+
+    def __init__(self, *, value, min, max, **_):
+        assert min <= value <= max
+        self.value, self._observers = value, []
+
+    def observe(self, function, names):
+        assert names == "value"
+        self._observers.append(function)
+
+    def move(self, value):
+        self.value = value
+        for function in self._observers:
+            function({"new": value})
+
+
+@pytest.mark.parametrize("has_sliders", [True, False])
+def test_a_slider_draws_the_picture_again_in_its_place(has_sliders, monkeypatch):
+    """Without ipywidgets there is the picture alone."""
+    pytest.importorskip("matplotlib").use("agg")
+    monkeypatch.syspath_prepend(str(FOLDER))
+    import matplotlib.pyplot as plt
+
+    import figures
+
+    shown, drawn, widgets = [], [], SimpleNamespace(FloatSlider=Slider, VBox=list)
+    handle = SimpleNamespace(update=lambda figure: shown.append(("again", figure)))
+    monkeypatch.setattr(figures, "display", lambda what, display_id=False: (shown.append(("new", what)), handle)[1])
+    monkeypatch.setitem(sys.modules, "ipywidgets", widgets if has_sliders else None)
+
+    def draw(blur, noise):
+        drawn.append((blur, noise))
+        return plt.figure()
+
+    figures.with_sliders(draw, blur=(0.5, 0.0, 3.0), noise=(0.0, -1.0, 1.0))
+    assert drawn == [(0.5, 0.0)] and plt.get_fignums() == []
+    if has_sliders:
+        shown[1][1][1].move(-0.25)
+        assert drawn == [(0.5, 0.0), (0.5, -0.25)]
+    assert [what for what, _ in shown] == (["new", "new", "again"] if has_sliders else ["new"])
 
 
 def test_a_large_image_is_refused():

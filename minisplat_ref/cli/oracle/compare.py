@@ -6,6 +6,7 @@ from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import CALLS, add_call_argument, add_output_arguments, module_of, publish
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
+from minisplat_ref.progress import with_progress
 
 DESCRIPTION = """\
 Compare a renderer with the float64 reference, stage by stage, and name the
@@ -132,7 +133,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         renderer = choose_renderer(args.backend, args.dtype)
         scenes, left_out = choose_scenes(renderer, args.scene, args.against, args.profile)
-    rows = [row for scene in scenes.values() for row in compare_scene(renderer, scene)]
+    compared = with_progress(scenes.values(), "comparing", "scenes")
+    rows = [row for scene in compared for row in compare_scene(renderer, scene)]
     settings = {
         "against": args.against,
         "conventions": {name: scene.conventions.name for name, scene in scenes.items()},

@@ -3,7 +3,7 @@
 SIFT, by COLMAP, on the CPU. *Standard* is COLMAP's own setting. *Dense* finds weaker features, and more of them, and
 searches once more along the epipolar lines of pairs that match. That takes some twenty times as long, so it is done
 only between photographs whose standard features say that they overlap. Photographs and pairs are handed over in
-batches: between them the bar on a terminal moves, and an interruption is noticed.
+batches: between them the progress bar moves, and an interruption is noticed.
 """
 
 import os
@@ -12,11 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
 from minisplat_ref.datasets.sfm.photographs import Photographs
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.lens import import_quiet_pycolmap
+from minisplat_ref.progress import progress_bar
 
 SEED = 0  # of RANSAC: the same photographs give the same matches
 NEIGHBOURS = (*range(1, 11), 16, 32, 64, 128, 256, 512)  # distances in the order of names, for sequential matching
@@ -73,7 +72,7 @@ def find_features(database: Path, photographs: Photographs, features: Features, 
         pycolmap.import_images(database, photographs.images, pycolmap.CameraMode.SINGLE, names, reader)
     masked = [name for name in photographs.originals if name in photographs.masked]
     others = [name for name in photographs.originals if name not in photographs.masked]
-    with _bar(f"{features.name} features", len(photographs.originals), " images") as bar:
+    with progress_bar(f"{features.name} features", "photographs", len(photographs.originals)) as bar:
         for batch in (*_batches(masked, n_at_once), *_batches(others, n_at_once)):
             # With a folder of masks, COLMAP skips a photograph that has none.
             reader.mask_path = photographs.masks if batch[0] in photographs.masked else ""
@@ -115,7 +114,7 @@ def match_features(database: Path, work: Path, pairs: Sequence[Pair], features: 
     verification.ransac.random_seed = SEED
     listed = pycolmap.ImportedPairingOptions(match_list_path=work / "pairs.txt")
     n_at_once = GUIDED_AT_ONCE * (os.cpu_count() or 1) if features.is_guided else PAIRS_AT_ONCE
-    with _bar(f"{features.name} matches", len(pairs), " pairs") as bar:
+    with progress_bar(f"{features.name} matches", "pairs", len(pairs)) as bar:
         for batch in _batches(pairs, n_at_once):
             Path(listed.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in batch), encoding="utf-8")
             pycolmap.match_image_pairs(database, options, listed, verification, pycolmap.Device.cpu)
@@ -175,8 +174,3 @@ def _batches(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
     """Yield the items in lists of at most ``size``."""
     for i in range(0, len(items), size):
         yield list(items[i : i + size])
-
-
-def _bar(description: str, total: int, unit: str) -> tqdm:
-    """Return a progress bar, which is shown only on a terminal."""
-    return tqdm(total=total, desc=description, unit=unit, leave=False, disable=None)

@@ -12,9 +12,8 @@ no camera, but training can start from them.
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
 from minisplat_ref.io.lens import import_quiet_pycolmap
+from minisplat_ref.progress import progress_bar
 
 SEED = 0
 SEEN_MIN = 15  # points with three views or more that a photograph must see for its camera to be credible
@@ -63,7 +62,7 @@ def map_photographs(database: Path, images: Path, work: Path, features: str, n_p
         folder = work / mapper
         folder.mkdir(parents=True)
         pycolmap.set_random_seed(SEED)  # for parts that have no seed among their options
-        with tqdm(total=n_photos, desc=f"{mapper} mapper", unit=" images", leave=False, disable=None) as bar:
+        with progress_bar(f"{mapper} mapper", "photographs", n_photos, delay=0.0) as bar:
             if mapper == "incremental":
                 options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
                 found = pycolmap.incremental_mapping(

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
-from tqdm import tqdm
 
 from minisplat_ref.datasets.photo_files import MASKS, enumerate_names, list_images
 from minisplat_ref.errors import InputError, InputWarning, one_line
@@ -27,6 +26,7 @@ from minisplat_ref.io.images import (
     resize_mask,
     write_image,
 )
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Bools
 
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
@@ -88,7 +88,7 @@ def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
     groups: dict[Group, list[str]] = {}
     masked = set()
     used = set()
-    for file in tqdm(list_images(source), desc="photographs", unit=" images", leave=False, disable=None):
+    for file in with_progress(list_images(source), "reading", "photographs"):
         relative = file.relative_to(source)
         name = _name_copy(relative)
         if name in originals:

@@ -81,7 +81,8 @@ def make_scene(
     test_every : int
         In walking order the first of this many views is a test view, like in loaders; 0 for no test views.
     progress : callable
-        Wraps the sequence of cameras while the views are traced; ``tqdm.tqdm`` shows a bar.
+        Wraps the sequence of cameras while the views are traced;
+        :func:`~minisplat_ref.progress.with_progress` shows a bar.
 
     Returns
     -------

@@ -43,6 +43,7 @@ from minisplat_ref.extensions.compression.levels8 import (
 )
 from minisplat_ref.io.formats import Format
 from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 VERSION = 2
@@ -113,7 +114,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     file = BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo(META, DATE), json.dumps(meta))
-        for name, image in images.items():
+        for name, image in with_progress(images.items(), "packing", "images"):
             packed = BytesIO()
             image.save(packed, "webp", lossless=True, exact=True, quality=100)  # exact: colours under alpha 0 count
             archive.writestr(zipfile.ZipInfo(f"{name}.webp", DATE), packed.getvalue())

@@ -46,6 +46,7 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.compression import spz_streams
 from minisplat_ref.io.formats import Format
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
@@ -58,6 +59,7 @@ LOG_SCALE_MIN = -10.0
 SMALLER_SHARE = 0.01  # of the Gaussians, from which on it is said that they are smaller than that
 COLOR_SCALE = 0.15
 SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
+BLOCK = 1 << 20  # bytes between two moves of the progress bar
 GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
 HEADER = struct.Struct("<IIIBBBB")
 WAY_OUT = "copy or export the file again"
@@ -120,7 +122,13 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         return spz_streams.pack(n, sh_degree, fractional_bits, (part.tobytes() for part in parts))
     header = HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0)
     compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
-    return compressor.compress(header + b"".join(part.tobytes() for part in parts)) + compressor.flush()
+    content = header + b"".join(part.tobytes() for part in parts)
+    packed = []
+    with progress_bar("packing", "MB", len(content)) as bar:
+        for i in range(0, len(content), BLOCK):
+            packed.append(compressor.compress(content[i : i + BLOCK]))
+            bar.update(len(content[i : i + BLOCK]))
+    return b"".join([*packed, compressor.flush()])
 
 
 def _fractional_bits(means: Floats, log_scales: Floats) -> int:

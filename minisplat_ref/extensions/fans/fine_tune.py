@@ -6,6 +6,7 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.arguments import add_shape, load_as_fans, shape_of
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.studies.study import downscale, iterations, seed
 
 EPILOG = """\
@@ -42,8 +43,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The scene, the model or the output cannot be used, or a number is out of range.
     """
-    from tqdm import tqdm
-
     from minisplat_ref.extensions.fans.mesh_files import save_fans
     from minisplat_ref.extensions.fans.tuning import fine_tune, measure
     from minisplat_ref.studies.kit import read_scene
@@ -55,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     start = load_as_fans(args.model, shape_of(args))
     scene = read_scene(args.scene, args.downscale)
     before = measure(start, scene, scene.test_views)
-    with tqdm(total=args.iterations, desc="vertices", leave=False, disable=None) as bar:
+    with progress_bar("vertices", "iterations", args.iterations) as bar:
         fans = fine_tune(start, scene, args.iterations, args.seed, lambda _: bar.update())
     after = measure(fans, scene, scene.test_views)
     save_fans(args.out, fans)

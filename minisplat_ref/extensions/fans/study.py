@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from minisplat_ref.extensions.fans import claims, profile
 from minisplat_ref.extensions.fans.profile import profile_error
 from minisplat_ref.extensions.fans.shapes import FanShape
 from minisplat_ref.extensions.fans.tuning import render_clipped
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.studies import kit
@@ -78,11 +78,11 @@ def run(args: argparse.Namespace) -> kit.Report:
     runs: list[dict[str, Any]] = []
     images: dict[str, Any] = {}
     for seed, gaussians in enumerate(kit.populations(args, scene)):
-        with tqdm(total=4, desc=f"seed {seed}", leave=False, disable=None) as bar:
+        with progress_bar(f"seed {seed}", "models", 4) as bar:
             shapes = {name: claims.shape_rows(gaussians, judge, shape) for name, shape in claims.FORMS.items()}
 
             def told(name: str, bar: Any = bar) -> None:
-                bar.set_postfix_str(name)
+                bar.set_description(name)
                 bar.update()
 
             rows, forms = claims.refit_rows(gaussians, judge, args.fine_tune, seed, told)

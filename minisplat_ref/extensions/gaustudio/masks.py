@@ -9,6 +9,7 @@ import numpy as np
 from minisplat_ref.extensions.gaustudio.sky_masks import by_color
 from minisplat_ref.io import load_scene, write_image
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.progress import with_progress
 
 EPILOG = """\
 example:
@@ -35,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     scene = load_scene(args.scene, test_every=0)
     shares = []
     with making_folder(args.out) as folder:
-        for view in scene.train_views:
+        for view in with_progress(scene.train_views, "looking for skies", "photographs"):
             is_sky = by_color(view.load(), "")
             file = folder / f"{view.name}.png"
             file.parent.mkdir(parents=True, exist_ok=True)

@@ -144,8 +144,8 @@ def disperse(means: Floats, members: list[Ints], h: float) -> tuple[float, Float
         v_x_i = -(1 / n) sum_j (x_i - x_j) / h^2 exp(...)
 
     over the pairs within ``REACH`` h of each other, beyond which E would be negative. In a region of more than
-    ``PAIRED_MAX`` every k-th stands for the others: pairs grow with the square, and where a few points lie far away, one
-    region holds almost everything.
+    ``PAIRED_MAX`` every k-th stands for the others: pairs grow with the square, and where a few points lie far away,
+    one region holds almost everything.
     """
     v, value, floor = np.zeros(means.shape), 0.0, np.exp(-(REACH**2) / 2)
     for region in members:

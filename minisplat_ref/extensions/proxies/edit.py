@@ -20,6 +20,7 @@ from minisplat_ref.extensions.proxies.nearest import nearest_triangles
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Bools, Floats
 
 DESCRIPTION = """\
@@ -103,10 +104,9 @@ def _select(args: argparse.Namespace, means: Floats) -> Bools:
     if args.sphere is not None:
         is_selected &= in_ball(means, np.array(args.sphere[:3]), args.sphere[3])
     if args.near is not None:
-        from tqdm import tqdm
 
         def bar(parts: Any) -> Any:
-            return tqdm(parts, desc="nearest triangles", leave=False, disable=None)
+            return with_progress(parts, "nearest triangles", "parts")
 
         is_selected &= nearest_triangles(means, load_mesh(args.near), bar).distances <= args.within
     return is_selected

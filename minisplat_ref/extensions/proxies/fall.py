@@ -27,6 +27,7 @@ from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, load_mesh, save_mesh
+from minisplat_ref.progress import with_progress
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Camera, Floats
 
@@ -120,8 +121,6 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Bind, then for each frame simulate, rebuild, draw and write."""
-    from tqdm import tqdm
-
     _check(args)
     gaussians, mesh, label = load_model(args.model), load_mesh(args.mesh), load_label(args.model)
     setting = Setting(np.array(args.gravity), _select_pinned(args, mesh), args.stretch, args.drag, args.floor)
@@ -132,9 +131,11 @@ def run(args: argparse.Namespace) -> int:
     state = State(mesh.vertices, np.zeros_like(mesh.vertices))
     records = []
     with making_folder(args.out) as folder:
-        binding = bind(gaussians, mesh, args.reach, partial(tqdm, desc="nearest triangles", leave=False, disable=None))
+        binding = bind(
+            gaussians, mesh, args.reach, partial(with_progress, description="nearest triangles", unit="parts")
+        )
         check_bound(binding, args.reach, args.model)
-        for frame in tqdm(range(args.frames), desc="frames", leave=False, disable=None):
+        for frame in with_progress(range(args.frames), "falling", "frames"):
             if frame > 0:
                 state = integrate(state, sheet, step, n_steps)
             now = Mesh(state.positions, mesh.faces)

@@ -9,6 +9,7 @@ from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import check_same_faces, load_mesh
+from minisplat_ref.progress import with_progress
 
 DESCRIPTION = """\
 Bind the Gaussians of a model to a mesh, and write them deformed as the mesh was
@@ -50,11 +51,9 @@ def add_reach(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Bind, rebuild, write."""
-    from tqdm import tqdm
-
     gaussians, rest, deformed = load_model(args.model), load_mesh(args.rest), load_mesh(args.deformed)
     check_same_faces(rest, deformed, args.deformed)
-    bar = partial(tqdm, desc="nearest triangles", leave=False, disable=None)
+    bar = partial(with_progress, description="nearest triangles", unit="parts")
     binding = bind(gaussians, rest, args.reach, bar)
     check_bound(binding, args.reach, args.model)
     save_ply(args.out, rebuild(deformed, binding), load_label(args.model))

@@ -18,6 +18,7 @@ from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
+from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Floats, Model
 
 ORBIT_SIZE = (320, 240)  # pixels
@@ -68,8 +69,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The model, the surroundings or the cameras cannot be used.
     """
-    from tqdm import tqdm
-
     if args.frames < 1:
         raise InputError(f"--frames is {args.frames}: give at least 1")
     background = np.array(args.background)
@@ -85,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     world = World(gaussians, tracer_for(whitened, GSPLAT_MAIN, CPU), around, background, GSPLAT_MAIN)
     with making_folder(args.out) as folder:
         names = file_names([view.name for view in views])
-        for name, view in zip(names, tqdm(views, desc="tracing", unit="view", disable=None), strict=True):
+        for name, view in zip(names, with_progress(views, "tracing", "views"), strict=True):
             image = shade(world, pixel_rays(view.camera, GSPLAT_MAIN))
             write_image(folder / f"{name}.png", image.reshape(view.camera.height, view.camera.width, 3))
     print(f"{len(views)} images in {args.out}")

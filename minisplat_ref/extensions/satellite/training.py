@@ -16,6 +16,7 @@ from minisplat_ref.io import save_ply
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import image_size, read_image
 from minisplat_ref.io.label import Label
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.types import Frame, Scene, View
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -62,8 +63,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--altitudes has {len(args.altitudes)} number(s): give LOW,HIGH in metres")
     low, high = check_altitudes(None if args.altitudes is None else tuple(args.altitudes))
     scene, frame = read_images(args.images, (low, high), args.points, args.seed)
+    recipe = find_recipe("satellite", args.iterations)
     with making_folder(args.out) as folder:
-        state = train(scene, find_recipe("satellite", args.iterations), seed=args.seed)
+        with progress_bar("training", "iterations", recipe.iterations) as bar:
+            state = train(scene, recipe, seed=args.seed, on_step=lambda _: bar.update())
         save_ply(folder / "point_cloud.ply", state.gaussians, Label("satellite"))
         arrays: dict[str, Any] = dict(state.shared)
         np.savez(folder / "shared.npz", **arrays)

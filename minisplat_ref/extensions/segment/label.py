@@ -11,6 +11,7 @@ from minisplat_ref.extensions.segment.assignment import UNSEEN, belongs, labels
 from minisplat_ref.extensions.segment.maps import read_masks
 from minisplat_ref.extensions.segment.model import read_subject, save_labelled, save_part
 from minisplat_ref.extensions.segment.votes import Votes, count_votes
+from minisplat_ref.progress import with_progress
 from minisplat_ref.reporting import markdown_table
 
 DESCRIPTION = """\
@@ -56,8 +57,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Model or masks cannot be used, the bias is not in [-1, 1], or no mask has the object that is asked for.
     """
-    from tqdm import tqdm
-
     if not -1 <= args.bias <= 1:
         raise InputError(f"--bias is {args.bias:g}: give a number from -1 to 1")
     if args.out.suffix.lower() != ".ply":
@@ -69,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if wanted is not None and wanted not in ids[1:]:
         option = "--extract" if args.extract is not None else "--remove"
         raise InputError(f"{option} {wanted}: the masks have {', '.join(map(str, ids[1:])) or 'no object'}")
-    bar = tqdm(masks, desc="counting votes", unit="mask", leave=False, disable=None)
+    bar = with_progress(masks, "counting votes", "masks")
     votes = count_votes(subject.placed, subject.renderer, ((view.camera, mask) for view, mask in bar), ids)
     n = len(subject.population.means)
     if wanted is None:

@@ -12,6 +12,7 @@ from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.model import read_labels, read_subject
 from minisplat_ref.io import write_image
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.progress import with_progress
 from minisplat_ref.reports.palette import SERIES
 from minisplat_ref.types import Ints
 
@@ -43,8 +44,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The model has no labels or there are no cameras.
     """
-    from tqdm import tqdm
-
     subject = read_subject(args.model, args.cameras)
     labels = read_labels(subject)
     if labels.max(initial=0) > np.iinfo(np.uint16).max:
@@ -52,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
             f"{args.model}: a label of {labels.max()} does not fit into a PNG; number objects below 65,536"
         )
     with making_folder(args.out) as folder:
-        for view in tqdm(subject.cameras, desc="drawing", unit="view", leave=False, disable=None):
+        for view in with_progress(subject.cameras, "rendering", "views"):
             ids = label_map(subject.placed, labels, subject.renderer, view.camera)
             for kind, image in (
                 ("ids", ids.astype(np.uint8 if ids.max() < 256 else np.uint16)),

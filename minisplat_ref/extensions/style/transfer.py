@@ -6,6 +6,7 @@ from typing import Any
 
 from minisplat_ref.arguments import integer
 from minisplat_ref.errors import InputError
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.studies.study import iterations, seed
 
 DESCRIPTION = """\
@@ -60,8 +61,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The run, the image or the weights cannot be used, or NEW is there already.
     """
-    from tqdm import tqdm
-
     from minisplat_ref.extensions.style.run_files import open_run, write_run
     from minisplat_ref.extensions.style.styling import Plan, check_style, default_weights, read_style, stylise
     from minisplat_ref.io.atomic import making_folder
@@ -77,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     image = read_style(args.image, max(camera.width, camera.height))
     check_style(image / 255, bank, str(args.image))
     plan = Plan(bank, default_weights(bank, args.strength), args.iterations, args.seed)
-    with making_folder(args.out) as folder, tqdm(total=2 * args.iterations, leave=False, disable=None) as bar:
+    with making_folder(args.out) as folder, progress_bar("painting", "iterations", 2 * args.iterations) as bar:
         styled = stylise(
             opened.gaussians,
             opened.scene,

@@ -8,6 +8,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.textured.population import DEGREE
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.progress import progress_bar
 from minisplat_ref.studies.study import downscale, iterations, seed
 
 
@@ -42,8 +43,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The scene, the PLY or the output cannot be used, or a number is out of range.
     """
-    from tqdm import tqdm
-
     from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
     from minisplat_ref.studies.kit import floats_of, read_scene
 
@@ -56,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.ply} holds no Gaussians: give the PLY of a run")
     scene = read_scene(args.scene, args.downscale)
     before = measure(gaussians, scene, scene.test_views)
-    with tqdm(total=args.iterations, desc="textures", leave=False, disable=None) as bar:
+    with progress_bar("textures", "iterations", args.iterations) as bar:
         start = prepare(gaussians, args.degree, args.replace)
         textured = fine_tune(
             start, scene, args.iterations, args.seed, is_frozen=args.frozen, on_step=lambda _: bar.update()

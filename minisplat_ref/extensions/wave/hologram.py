@@ -24,6 +24,7 @@ from minisplat_ref.io.frames import frame_of_means, place_camera, place_populati
 from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.io.viewpoints import Viewpoint
+from minisplat_ref.progress import with_progress
 from minisplat_ref.training.representation import WORLD_UNITS
 
 DESCRIPTION = """\
@@ -101,8 +102,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The model or the camera cannot be used, nothing is in front of it, or the pitch aliases.
     """
-    from tqdm import tqdm
-
     if len(args.wavelengths) != 3:
         raise InputError(f"--wavelengths has {len(args.wavelengths)}: give three in nm, of red, green and blue light")
     file = args.model / "point_cloud.ply" if args.model.is_dir() else args.model
@@ -125,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
     check_sampling(placed.scene.flats, grid, wavelengths, thickness / 2)
     fields = [
         BLENDING[args.blending](placed.scene, grid, wavelength, channel)
-        for channel, wavelength in enumerate(tqdm(wavelengths, desc="blending", unit="colour", disable=None))
+        for channel, wavelength in enumerate(with_progress(wavelengths, "blending", "colours"))
     ]
     depths = frame.unit * np.array([placed.box.nearest, placed.box.farthest])
     hologram = Hologram(np.stack(fields), wavelengths, pitch, depths, thickness)

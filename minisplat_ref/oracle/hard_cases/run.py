@@ -19,6 +19,7 @@ from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, render_subject, splat_tapes
 from minisplat_ref.oracle.thresholds import Thresholds, span_of, thresholds
 from minisplat_ref.oracle.tolerances import BLOCK_FLOOR, OWN_KERNELS
+from minisplat_ref.progress import with_progress
 from minisplat_ref.splatting import SplatTape
 from minisplat_ref.types import Bools
 
@@ -62,7 +63,7 @@ def run_hard_cases(cases: Sequence[HardCase], precisions: Sequence[Precision] = 
     """
     return Report(
         "Hard cases: every precision against the reference in float64, forward and backward",
-        tuple(run_hard_case(case, precisions) for case in cases),
+        tuple(run_hard_case(case, precisions) for case in with_progress(cases, "hard cases", "cases")),
         {"precisions": [precision.label for precision in precisions]},
     )
 
