@@ -113,9 +113,9 @@ def describe_degrees(state: TrainState) -> str:
     degrees = state.stats[DEGREES]
     shares = np.bincount(degrees, minlength=SH_DEGREE_MAX + 1) / max(len(degrees), 1)
     mean = 3 * (1 + n_coefficients(degrees)).sum() / max(len(degrees), 1)
-    each = ", ".join(f"{share:.0%}" for share in shares)
+    flat, *others = (f"{share:.0%}" for share in shares)
     return (
-        f"{each} of the Gaussians need harmonics of degree 0, which is one colour from all sides, 1, 2, 3:"
+        f"{flat} of the Gaussians have one colour from all sides, {', '.join(others)} harmonics of degree 1, 2, 3:"
         f" {mean:.1f} numbers for a colour on average, not 48"
     )
 
