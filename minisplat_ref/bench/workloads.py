@@ -109,7 +109,9 @@ def get_workload(name: str, data: Path | None) -> Workload:
     if name not in WITH_DATA:
         raise InputError(f"workload {name!r} is unknown; choose from {', '.join((*FREE, *WITH_DATA))}")
     if data is None:
-        raise InputError(f"workload {name} needs gsplat's test_garden.npz: give its place with --data")
+        raise InputError(
+            f"workload {name} needs --data with gsplat's test_garden.npz, which minisplat-ref data garden fetches"
+        )
     return WITH_DATA[name](data)
 
 

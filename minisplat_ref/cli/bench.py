@@ -134,7 +134,7 @@ def _benchmark(args: argparse.Namespace) -> "Report":
     if opensplat is not None:
         cases += against_opensplat(opensplat, args.scene, args.downscale, args.iterations)
     if args.data is None and args.workloads is None:
-        progress("garden, garden20k: skipped, they need gsplat's test_garden.npz (--data)")
+        progress("garden, garden20k: skipped; minisplat-ref data garden fetches their points, for --data data/garden")
     title = "Speed against error: every time beside its error against the float64 reference"
     return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
 

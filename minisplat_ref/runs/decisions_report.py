@@ -15,15 +15,15 @@ from minisplat_ref.reports.plots import plot, to_svg
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
 
 DONE = {
-    COOLED: "the rates began to fall",
-    "exposures": "exposures were switched on",
+    COOLED: "the learning rates began to fall",
+    "exposures": "each photograph got its own exposure",
     FINER: "views of twice the width and height were shown",
     "sky": "a sky took the place of the largest Gaussians",
-    "poses": "the refinement of poses was switched on",
+    "poses": "the poses of the cameras were trained, too",
     "anti-aliasing": "opacities were compensated for anti-aliasing",
-    "prune": "it pruned",
-    "prune ended": "the prune ended",
-    "bands": "it removed idle bands of the harmonics",
+    "prune": "Gaussians were removed",
+    "prune ended": "the removal ended",
+    "bands": "colours that hardly depend on the direction were made simpler",
 }
 HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")
 PSNR = "PSNR of the held-out training views (dB)"
@@ -71,10 +71,10 @@ def story(pace: Pace, n_iterations: int) -> str:
         )
     sentences += [f"After iteration {d.step:,} {DONE.get(d.what, d.what)}: {d.why}{_error(d)}." for d in pace.decisions]
     if pace.cooling_from is None:
-        sentences.append(f"It was stopped at iteration {n_iterations:,}, while the rates were constant.")
+        sentences.append(f"It was stopped at iteration {n_iterations:,}, before the learning rates fell.")
     elif pace.last_step == n_iterations:
         sentences.append(
-            f"With all training views and falling rates it continued to iteration {n_iterations:,}, its end."
+            f"With all training views and falling learning rates it continued to iteration {n_iterations:,}, its end."
         )
     else:
         sentences.append(f"It was stopped at iteration {n_iterations:,} of the {pace.last_step:,} that it had planned.")

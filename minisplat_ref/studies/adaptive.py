@@ -62,7 +62,7 @@ def clones_while_growing(
 ) -> str | None:
     """Clone and split as 3DGS does, until the rates fall."""
     if state.pace.cooling_from is not None:
-        return "nothing done: the rates are falling"
+        return "nothing done: the learning rates are falling"
     return gaussian_splatting.clone_and_split(state, iteration, threshold=threshold, size_fraction=size_fraction)
 
 

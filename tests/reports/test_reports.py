@@ -166,8 +166,8 @@ PACE = Pace(
 def test_decisions_are_told_with_their_evidence():
     text = story(PACE, 1280)
     assert "from 21.00 dB after 100 iterations to 28.00 dB after 800" in text
-    assert "After iteration 800 the rates began to fall: they gain little (standard error 0.05 dB)." in text
-    assert "After iteration 801 it pruned: 9 of 10 carry 0.98." in text and text.endswith(
+    assert "After iteration 800 the learning rates began to fall: they gain little (standard error 0.05 dB)." in text
+    assert "After iteration 801 Gaussians were removed: 9 of 10 carry 0.98." in text and text.endswith(
         "continued to iteration 1,280, its end."
     )
     page_ = decisions_section(PACE, 1280)
@@ -177,7 +177,7 @@ def test_decisions_are_told_with_their_evidence():
 def test_a_training_that_was_stopped_says_so():
     assert story(PACE, 1000).endswith("stopped at iteration 1,000 of the 1,280 that it had planned.")
     early = decisions_section(Pace(), 40)
-    assert "stopped at iteration 40, while the rates were constant" in early and "<svg" not in early
+    assert "stopped at iteration 40, before the learning rates fell" in early and "<svg" not in early
 
 
 # Pieces

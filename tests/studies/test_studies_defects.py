@@ -52,7 +52,7 @@ def test_command(tmp_path, capsys):
         row = result["summary"][run["condition"]]
         assert row == {"trials": 1, **{what: int(what in run["switched_on"]) for what in defects.SWITCHES}}
         del run["evidence"]["switch_sky_on"]
-        assert all("explain" in note for note in run["evidence"].values()) and len(run["evidence"]) == 3
+        assert all("fitted to" in note for note in run["evidence"].values()) and len(run["evidence"]) == 3
     printed = capsys.readouterr().out
     assert f"after {defects.decision_step(list(defects.SWITCHES))} iterations" in printed and "| poses " in printed
 

@@ -110,7 +110,11 @@ def decided(truth, scene):
 def test_two_sizes_ask_for_it(truth):
     scene = scene_of(truth, has_two_sizes=True)
     state, note = decided(truth, scene)
-    assert "explain" in note and state.pace.switched_on == ("antialiasing",) and COMPENSATION in state.shared
+    assert (
+        "improve the other half by" in note
+        and state.pace.switched_on == ("antialiasing",)
+        and COMPENSATION in state.shared
+    )
     assert state.pace.decisions[0].gain > GAIN_MIN
     again = switch_antialiasing_on(state, iteration_of(scene), min_antialiasing_gain=GAIN_MIN)
     assert again == "nothing done: opacities are compensated"
@@ -127,9 +131,13 @@ def test_of_gains_and_compensation_what_explains_more(gain, min_antialiasing_gai
     scene = scene_of(truth, has_two_sizes=True)
     state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
     note = switch_exposure_on(state, iteration_of(scene), **least)
-    assert ("compensation" not in note) == (EXPOSURES in state.shared) == are_on
+    assert ("compensated" not in note) == (EXPOSURES in state.shared) == are_on
 
 
 def test_one_size_does_not(truth):
     state, note = decided(truth, scene_of(truth, has_two_sizes=False))
-    assert note.startswith("nothing done: amounts") and state.pace == Pace() and state.shared == {}
+    assert (
+        note.startswith("nothing done: opacities compensated by amounts")
+        and state.pace == Pace()
+        and state.shared == {}
+    )

@@ -29,5 +29,5 @@ def ask_about_antialiasing(state: TrainState, iteration: Iteration) -> Answer | 
         return "opacities are compensated"
     n_views = len(iteration.scene.train_views)
     evidence = antialiasing_evidence(state, iteration, trained_ids(n_views, iteration.cooling, state.pace))
-    why = f"amounts of compensation that spread by {evidence.spread:.2f} explain {evidence.gain:.2f} dB of other halves"
+    why = evidence.describe(f"opacities compensated by amounts that differ by {evidence.spread:.2f}")
     return Answer(evidence, why, lambda: compensation(n_views))

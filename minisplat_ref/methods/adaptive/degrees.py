@@ -113,8 +113,11 @@ def describe_degrees(state: TrainState) -> str:
     degrees = state.stats[DEGREES]
     shares = np.bincount(degrees, minlength=SH_DEGREE_MAX + 1) / max(len(degrees), 1)
     mean = 3 * (1 + n_coefficients(degrees)).sum() / max(len(degrees), 1)
-    each = ", ".join(f"{share:.0%}" for share in shares)
-    return f"{each} of the Gaussians have degree 0, 1, 2, 3: {mean:.1f} numbers for a colour, not 48"
+    flat, *others = (f"{share:.0%}" for share in shares)
+    return (
+        f"{flat} of the Gaussians have one colour from all sides, {', '.join(others)} harmonics of degree 1, 2, 3:"
+        f" {mean:.1f} numbers for a colour on average, not 48"
+    )
 
 
 def without_idle_degrees(

@@ -59,6 +59,15 @@ class Evidence(NamedTuple):
     fitted: Floats
     """[V, K] x of the whole photographs, minus their mean."""
 
+    def describe(
+        self, what: str, fitted_to: str = "one half of each photograph", judged_by: str = "the other half"
+    ) -> str:
+        """Say in a sentence without an end what a calibration, fitted to one part, does to another."""
+        verb = "improves" if what.startswith("a ") else "improve"
+        if self.gain < 0:
+            verb = verb.replace("improve", "worsen")
+        return f"{what}, fitted to {fitted_to}, {verb} {judged_by} by {abs(self.gain):.2f} dB"
+
     @property
     def spread(self) -> float:
         """Root mean square of x over photographs and fields."""

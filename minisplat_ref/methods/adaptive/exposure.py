@@ -57,7 +57,7 @@ def ask_about_exposures(state: TrainState, iteration: Iteration) -> Answer:
     n_views = len(iteration.scene.train_views)
     ids = trained_ids(n_views, iteration.cooling, state.pace)
     evidence = exposure_evidence(state, iteration, ids)
-    why = f"gains that spread by {evidence.spread:.3f} explain {evidence.gain:.2f} dB of the other halves"
+    why = evidence.describe(f"exposures that differ by {evidence.spread:.1%}")
 
     def begin() -> dict[str, Floats]:
         exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)

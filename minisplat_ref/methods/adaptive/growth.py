@@ -52,7 +52,7 @@ def grow(
         Largest number of Gaussians to grow to; the training may begin with more.
     """
     if state.pace.cooling_from is not None:
-        return "nothing done: the rates are falling"
+        return "nothing done: the learning rates are falling"
     means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
     n = n_rows(state.gaussians)
     candidates = np.flatnonzero(means >= threshold)
@@ -62,7 +62,7 @@ def grow(
         candidates = np.sort(candidates[np.argsort(-ranks[candidates], kind="stable")[:most]])
     share = np.count_nonzero(means >= threshold) / max(n, 1)
     apply_edit(state, halves(state.gaussians, candidates, offset=offset))
-    return f"{share:.1%} above the threshold"
+    return f"{share:.1%} have a gradient above the threshold"
 
 
 def _error_weights(state: TrainState, iteration: Iteration, max_views: int) -> Floats:

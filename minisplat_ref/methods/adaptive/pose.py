@@ -33,7 +33,7 @@ def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     evidence = pose_evidence(state, iteration, ids)
-    why = f"displacements of {evidence.spread:.2f} pixels explain {evidence.gain:.2f} dB of the other halves"
+    why = evidence.describe(f"cameras turned by {evidence.spread:.2f} pixels")
 
     def begin() -> dict[str, Floats]:
         corrections = zero_corrections(len(views))

@@ -14,7 +14,7 @@ from minisplat_ref.training.state import Iteration, TrainState, begin_cooling
 def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     """Render the held-out training views and record their PSNR."""
     if iteration.cooling is None or state.pace.cooling_from is not None:
-        return "nothing done: the rates fall"
+        return "nothing done: the learning rates are falling"
     measurement = evaluate_held_out(state, iteration, iteration.cooling)
     state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))
     return f"{measurement.psnr:.2f} dB"
@@ -64,8 +64,8 @@ def proceed_when_little_is_gained(
     slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB per doubling
     gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
     if gain >= min_gain:
-        return f"{gain:.2f} dB for each doubling of the work"
-    why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {min_gain}"
+        return f"{gain:.2f} dB from twice the work"
+    why = f"twice the work would bring the held-out views {gain:.2f} dB, less than {min_gain:g} dB"
     if iteration.n_halvings:
         state.pace = pace.with_decision(Decision(iteration.step, FINER, why, gain, error))
     else:

@@ -75,7 +75,10 @@ def prune_in_slices(
     state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
     psnr_cost, ssim_cost = foreseen_costs(state.pace.before_slices)
     if psnr_cost > max_psnr_cost or ssim_cost > max_ssim_cost:
-        why = f"with one more slice it may have cost held-out views {psnr_cost:.2f} dB and {ssim_cost:.4f} of SSIM"
+        why = (
+            f"with more removed, the held-out views might lose {psnr_cost:.2f} dB and {ssim_cost:.4f} of SSIM in all;"
+            f" at most {max_psnr_cost:g} dB and {max_ssim_cost:g} are allowed"
+        )
         state.pace = state.pace.with_decision(Decision(iteration.step, "prune ended", why, None, None))
         take_all_views(state, iteration)
         return
@@ -93,7 +96,7 @@ def prune_in_slices(
         return
     apply_edit(state, keep(state.gaussians, rows))
     lost = 10.0 * np.log10(1.0 + float(np.delete(costs.changes, rows).sum()) / costs.squared_error)
-    why = f"{n - len(rows):,} of {n:,} Gaussians change the training views by {lost:.2f} dB"
+    why = f"without {n - len(rows):,} of {n:,} Gaussians the training views lose only {lost:.2f} dB"
     _record(state, iteration, why)
 
 

@@ -157,7 +157,7 @@ def ask_about_a_sky(state: TrainState, iteration: Iteration) -> Answer | str:
     if len(pixels) < SKY_VIEWS_MIN:
         return f"{len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
     evidence = compare(*(photographs_behind(state, iteration, pixels, rows) for rows in (None, ~large)))
-    why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of what others show there"
+    why = evidence.describe(f"a sky in place of {n:,} large Gaussians", "half of the photographs", "the others")
 
     def begin() -> dict[str, Floats]:
         sky = fit_sky(photographs_behind(state, iteration, find_counted_pixels(iteration, ids), ~huge))

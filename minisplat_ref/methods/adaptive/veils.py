@@ -40,7 +40,7 @@ def remove_veils(
     is_veil = (before > max_share_before * all_) & (before >= min_weight_before)
     if is_veil.any():
         apply_edit(state, keep(state.gaussians, ~is_veil))
-    return f"{np.count_nonzero(is_veil)} lay before sparse points"
+    return f"{np.count_nonzero(is_veil)} stood before points that photographs show"
 
 
 def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:

@@ -129,10 +129,10 @@ def test_a_slope_by_hand():
     steps = [800, 1000, 1200, 1400, 1600]
     gains = [(20 + np.log2(s), 25 + 0.2 * np.log2(s)) for s in steps]
     state = measured(list(zip(steps, gains, strict=True)))
-    assert decide(state, 1600) == "0.60 dB for each doubling of the work" and state.pace.cooling_from is None
+    assert decide(state, 1600) == "0.60 dB from twice the work" and state.pace.cooling_from is None
     flat = [(20 + 0.5 * np.log2(s), 25 - 0.1 * np.log2(s)) for s in steps]
     state = measured(list(zip(steps, flat, strict=True)))
-    assert "gain 0.20 dB" in decide(state, 1600)
+    assert "would bring the held-out views 0.20 dB, less than" in decide(state, 1600)
     (decision,) = state.pace.decisions
     assert decision.gain == pytest.approx(0.2) and decision.standard_error == pytest.approx(0.3)
     assert (state.pace.cooling_from, state.pace.last_step, state.view_order) == (1600, 2560, [])
@@ -235,7 +235,7 @@ def test_what_the_photographs_would_hardly_miss_goes_in_slices(cooling):
     keep_out = collect_removal_costs(state.model, here.scene.train_views, RenderSettings(here.scene.background))
     prune_in_slices(state, here._replace(step=31), **settings | {"min_slope": 1e9})
     assert_array_equal(state.gaussians.means, before.means[np.sort(np.argsort(keep_out.changes, kind="stable")[40:])])
-    assert "40 of 200 Gaussians change the training views by" in state.pace.decisions[-1].why
+    assert "without 40 of 200 Gaussians the training views lose only" in state.pace.decisions[-1].why
     prune_in_slices(state, here._replace(step=51), **settings | {"min_slope": 1e-9})
     assert len(state.gaussians.means) == 160 and len(state.pace.decisions) == 1  # a slice of less than 1 % is left out
 

@@ -137,7 +137,7 @@ def test_it_is_cut_once_and_moments_go_too(matt):
     assert not state.stats[DEGREES].any() and not state.gaussians.sh_rest.any() and SEEN not in state.stats
     assert not state.adam.first.sh_rest.any() and not state.adam.second.sh_rest.any()
     (decision,) = state.pace.decisions
-    assert decision.what == "bands" and decision.why.startswith("100%, 0%, 0%, 0% of the Gaussians")
+    assert decision.what == "bands" and decision.why.startswith("100% of the Gaussians have one colour from all sides")
 
 
 # Trained --------------------------------------------------------------------------------------------------------------

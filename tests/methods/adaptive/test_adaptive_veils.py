@@ -49,7 +49,7 @@ def test_a_veil_goes_and_surfaces_stay():
     np.testing.assert_allclose(before, [0.4, 0, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(all_, [0.4, 0.54, 0.9, 0], rtol=1e-4)
     note = veils.remove_veils(state, iteration, **SETTINGS)
-    assert note == "1 lay before sparse points"
+    assert note == "1 stood before points that photographs show"
     np.testing.assert_array_equal(state.gaussians.means, model.means[1:])
     assert len(state.adam.first.means) == 3
 
