@@ -65,7 +65,7 @@ def count_votes(population: Any, renderer: Renderer, views: Iterable[tuple[Camer
     known = tuple(sorted({0, *ids}))
     weights = np.zeros((len(known), len(population.means)))
     for camera, mask in views:
-        weights += _votes_of_view(population, renderer, camera, mask, known)
+        weights += votes_of_view(population, renderer, camera, mask, known)
     return Votes(known, weights)
 
 
@@ -76,8 +76,24 @@ def colored(population: Any, colors: Floats) -> Any:
     return population._replace(sh_dc=sh_dc, sh_rest=np.zeros((n, 0, 3), dtype))
 
 
-def _votes_of_view(population: Any, renderer: Renderer, camera: Camera, mask: Ints, ids: tuple[int, ...]) -> Floats:
-    """Return A [E, N] of one view."""
+def votes_of_view(population: Any, renderer: Renderer, camera: Camera, mask: Ints, ids: tuple[int, ...]) -> Floats:
+    """Return A [E, N] of one view.
+
+    Parameters
+    ----------
+    population : Gaussians, or a relative's population
+    renderer : Renderer
+    camera : Camera
+    mask : ndarray of shape (H, W) of int
+        Its labels.
+    ids : tuple of E ints
+        The labels that count, ascending.
+
+    Raises
+    ------
+    InputError
+        The weights do not add up to the accumulated opacity.
+    """
     dtype = population.means.dtype
     gray = colored(population, np.full((len(population.means), 3), 0.5))  # no channel is clamped
     output, tape = renderer.render(Model(gray), view_from(camera), Request(np.zeros(3, dtype)))
