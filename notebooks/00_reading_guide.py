@@ -186,6 +186,7 @@ notes = {
     "constants": "conventions",
     "errors": "bad input",
     "reporting": "tables",
+    "progress": "bars",
     "memory": "estimates",
     "arguments": "options",
 }

@@ -214,6 +214,7 @@ turned = with_planted_error("transposed-view", "float64")
 transposed = run_stages(plant("transposed-view", CPU), scene, "float64")
 
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.3))
+figure.get_layout_engine().set(w_pad=0.12)  # for the labels of the colour bar
 show(axes[0], a["image"], "reference")
 show(axes[1], transposed["image"], "view rotation transposed")
 figure.colorbar(show_digits(axes[2], transposed["image"], a["image"], "error, log10"), ax=axes[2])
