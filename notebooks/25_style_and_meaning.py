@@ -30,7 +30,7 @@ from minisplat_ref.extensions.segment import study as masks_study
 from minisplat_ref.extensions.segment.assignment import belongs, labels
 from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.render import paint
-from minisplat_ref.extensions.segment.votes import votes_of_view, count_votes
+from minisplat_ref.extensions.segment.votes import count_votes, votes_of_view
 from minisplat_ref.extensions.style import study as style_study
 from minisplat_ref.extensions.style.reference import match_colors
 from minisplat_ref.extensions.style.styling import Plan, stylise

@@ -31,7 +31,7 @@ from minisplat_ref.runs.scoring import renderer_of
 from minisplat_ref.runs.settings import Settings, load, load_frame, load_model, recipe_of
 from minisplat_ref.types import Scene
 
-PLAN, PICTURE = "plan.json", "plan.png"
+PLAN = "plan.json"
 COARSE = "coarse"
 COARSE_RECIPE = "3dgs-accel"  # its Gaussians are what every recipe can start from
 COARSE_PART = 4  # a quarter of the iterations of a training of the whole
@@ -246,7 +246,7 @@ def describe(asked: Asked, plan: Plan) -> str:
     total = asked.coarse.iterations + sum(planned.iterations for planned in plan.blocks)
     return (
         f"{len(numbers)} blocks of {_range(numbers)} photographs, {total:,} iterations in all; {plan.trained:.0%} of"
-        f" the pixels are trained on; see {asked.folder / PICTURE}"
+        f" the pixels are trained on; see {asked.folder / run_folder.BLOCK_PLAN}"
     )
 
 

@@ -14,7 +14,6 @@ from minisplat_ref.blocks.merge import merge, write_history
 from minisplat_ref.blocks.picture import draw_plan
 from minisplat_ref.blocks.plan import (
     COARSE,
-    PICTURE,
     PLAN,
     Asked,
     Plan,
@@ -29,7 +28,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.frames import return_camera, return_points
 from minisplat_ref.memory import free_bytes
 from minisplat_ref.runs.cluster import Workers, carry_out_all
-from minisplat_ref.runs.run_folder import has_begun
+from minisplat_ref.runs.run_folder import BLOCK_PLAN, has_begun
 from minisplat_ref.runs.settings import Settings, load_frame, load_model, load_photographs, recipe_of
 from minisplat_ref.runs.trainings import HEADINGS, status_of, train_here, words_of, words_to_end
 from minisplat_ref.runs.worker import Job
@@ -87,7 +86,7 @@ def plan_blocks(asked: Asked) -> Plan:
     plan = make_plan(asked, scene)
     centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])
     means = load_model(folder, asked.coarse).gaussians.means
-    draw_plan(plan, centers, return_points(means, frame), asked.folder / PICTURE)
+    draw_plan(plan, centers, return_points(means, frame), asked.folder / BLOCK_PLAN)
     save_plan(asked, plan)
     print(describe(asked, plan))
     return plan

@@ -23,6 +23,7 @@ PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
 CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
 DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
 REPORT = "report.html"  # all of it to look at
+BLOCK_PLAN = "plan.png"  # the blocks seen from above
 BLOCKS = "blocks"  # the trainings of which it was merged, where it was trained in blocks
 RENDERS = "renders"  # truth | render | error of each test view
 

@@ -11,7 +11,7 @@ from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.names import file_names
 from minisplat_ref.reports.commands import command
 from minisplat_ref.reports.images import fit_image, split_images
-from minisplat_ref.reports.page import cards, code, curves, folded, page, paragraph, section, table
+from minisplat_ref.reports.page import add_caption, cards, code, curves, folded, page, paragraph, section, table
 from minisplat_ref.reports.palette import PURPLE
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.decisions_report import decisions_section
@@ -27,6 +27,9 @@ N_SHOWN = 6  # test views with images; all are in the table
 LARGEST = 1000  # pixels of an image's longer side in the page
 
 VIEWS_TEXT = f"The training never saw these views. {ERROR_TEXT}"
+BLOCKS_TEXT = """\
+The scene was trained in blocks, each from the photographs in which it fills a quarter of the pixels. Of each block,
+this model has what lies in its core. The blocks' own pages are in the folder blocks."""
 FIRED_TEXT = """\
 What the recipe does besides gradient steps, in this run: how often, in how many steps as published, when, and by how
 many Gaussians their number rose or fell."""
@@ -64,6 +67,11 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
     sections = [cards(_key_figures(metrics, log[0]["n_gaussians"] if log else None))]
     if metrics["per_view"]:
         sections.append(_views(folder, metrics["per_view"]))
+    if (folder / run_folder.BLOCK_PLAN).exists():
+        plan = add_caption(
+            read_image(folder / run_folder.BLOCK_PLAN)[..., :3], "cores, and around them what each block trains"
+        )
+        sections.append(section("Trained in blocks", paragraph(BLOCKS_TEXT), plan))
     if (folder / run_folder.DECISIONS).exists():
         pace = from_metadata(run_folder.read_json_object(folder / run_folder.DECISIONS))
         sections.append(decisions_section(pace, n_iterations))

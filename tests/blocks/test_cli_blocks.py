@@ -67,6 +67,7 @@ def test_the_folder_is_a_run_with_its_plan(finished, capsys):
     metrics = read_json(finished / "metrics.json")
     assert metrics["iterations"] == 16 and len(metrics["per_view"]) == 3
     assert metrics["train_seconds"] > 0
+    assert "Trained in blocks" in (finished / "report.html").read_text()
     assert main(["eval", str(finished), "--out", str(finished.parent / "eval")]) == 0
     assert main(["info", str(finished)]) == 0
     assert "16 iterations" in capsys.readouterr().out
