@@ -279,7 +279,14 @@ def _chamfer(gaussians: Any, surface: Surface | None) -> dict[str, float | None]
 
 
 def peak_rss_mb() -> float | None:
-    """Return the most memory that this process has held, MB; None on systems that do not say."""
+    """Return the most memory that this process has held, MB; None on systems that do not say.
+
+    Linux hands what ``getrusage`` says down from the process that started this one, so its own count is read there.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        lines = (line.split() for line in status.read_text().splitlines())
+        return next((int(words[1]) * 1.024e-3 for words in lines if words[0] == "VmHWM:"), None)  # it counts in KiB
     try:
         import resource  # absent on Windows
     except ImportError:

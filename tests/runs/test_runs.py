@@ -693,3 +693,12 @@ def test_an_error_of_the_program_keeps_its_traceback_and_the_work(original, tmp_
     (note,) = caught.value.__notes__
     assert note == f"minisplat-ref: stopped; iteration 12 is saved; to continue: minisplat-ref train --resume {folder}"
     assert main(["train", "--resume", str(folder)]) == 0
+
+
+def test_the_peak_is_of_this_process_alone():
+    """Linux hands what getrusage says down to a process that a large one starts."""
+    held = np.ones(50_000_000)  # 400 MB
+    code = "from minisplat_ref.runs.run import peak_rss_mb; print(peak_rss_mb())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 20 < float(done.stdout) < held.nbytes / 1e6
+    assert run.peak_rss_mb() > held.nbytes / 1e6
