@@ -20,6 +20,7 @@ import numpy as np
 from minisplat_ref.types import Floats
 
 ROWS_MAX = 512  # of the memory
+RANK_MIN = 1e-3  # of the largest singular value: what is below counts as nothing
 CHUNK = 1_024  # features that are compared with the memory at once
 
 
@@ -55,12 +56,15 @@ def remember(features: Iterable[Floats], similarity: float) -> Floats:
 
 
 def first_keys(memory: Floats, n: int) -> Floats:
-    """Return P [D, n]: the identity where n is D, else the memory's first principal axes, and zeros beyond D."""
-    d = memory.shape[1]
-    if n == d:
-        return np.eye(d)
-    axes = np.linalg.svd(memory, full_matrices=True)[2].T  # [D, D]
-    return np.pad(axes[:, :n], ((0, 0), (0, max(0, n - d))))
+    """Return P [D, n]: the memory's n first principal axes, scaled so that keys have a mean square of 1 along each.
+
+    There are zeros for axes beyond D, and for those in which the memory has nothing.
+    """
+    _, sizes, axes = np.linalg.svd(memory / np.sqrt(len(memory)), full_matrices=False)
+    is_there = sizes > RANK_MIN * sizes.max(initial=0.0)
+    axes = axes[is_there][:n] / sizes[is_there][:n, None]
+    keys: Floats = np.pad(axes, ((0, n - len(axes)), (0, 0))).T
+    return keys
 
 
 class Reading(NamedTuple):

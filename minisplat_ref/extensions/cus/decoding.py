@@ -68,7 +68,7 @@ def decode(model: Model, view: View, networks: Networks, *, with_queries: bool =
     networks : Networks
         That run the networks.
     with_queries : bool
-        Whether Gaussians get their queries, too.
+        Whether Gaussians get queries instead of their colours.
     """
     g: Anchors = model.gaussians
     (n, k), dtype = (len(g.means), g.n_children), g.means.dtype
@@ -81,7 +81,7 @@ def decode(model: Model, view: View, networks: Networks, *, with_queries: bool =
     for name, width in NETWORKS.items():
         network = _network(name, model.shared, dtype)
         y[name] = np.zeros((n * k, width), dtype)
-        if network and n:
+        if network and n and not (with_queries and name == COLOR):
             found, tapes[name] = networks.forward(network, x)
             y[name] = found.reshape(n * k, width)
     gaussians = Gaussians(

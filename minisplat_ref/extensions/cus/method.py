@@ -142,7 +142,7 @@ ANCHORS = Representation(
         embedding=32,
         query=15,
         features="",
-        similarity=0.98,
+        similarity=0.9,
     ),
     renderer=Renderer("cus", render, render_vjp, SPLATTING.channels),
     rates=ANCHOR_RATES,

@@ -131,7 +131,7 @@ def initial_shared(
     shared: dict[str, Floats] = {}
     for name, width in NETWORKS.items():
         shared |= to_shared(name, _starting_at_zero((latent + 3 + embedding, hidden, width * children), rng))
-    shared |= to_shared(QUERY, _starting_at_zero((latent + 3 + embedding, hidden, query), rng))
+    shared |= to_shared(QUERY, make_network((latent + 3 + embedding, hidden, query), rng))
     shared |= to_shared(MIX, (Layer(np.eye(query + 3, query), np.zeros(query)),))
     shared[CAMERAS] = np.zeros((len(scene.train_views), embedding))
     n_channels: dict[str, int] = {}

@@ -53,7 +53,7 @@ def small(rng: np.random.Generator) -> Representation:
         found = {name: array + SPREAD * rng.normal(size=array.shape) for name, array in found.items()}
         return {**found, **memory_of(rng)}
 
-    extend = partial(as_anchors, voxel=1.0, children=CHILDREN, latent=LATENT)
+    extend = partial(as_anchors, voxel=2.0, children=CHILDREN, latent=LATENT)
     return ANCHORS._replace(extend=extend, shared=shared, rates=Rates({"sh_rest": 0.0}, frozenset()))
 
 
