@@ -20,7 +20,6 @@ The loss is that of 3DGS, with 0.1 (L2 + 1 - cos) of the features and 0.01 times
     minisplat-ref train SCENE --recipe cus --set features=DIR --out runs/anchors
     minisplat-ref cus features runs/anchors --out maps
     minisplat-ref study cus/floats --out DIR
-    minisplat-ref study cus/photographs room --out DIR
     minisplat-ref oracle gradients --extension cus
 
 ``features=DIR`` has a map for each photograph, ``NAME.npy`` or ``NAME.npz`` of [h, w, D], of whatever network; without
@@ -41,11 +40,13 @@ Left out: the growing of anchors, and the language model.
 from pathlib import Path
 from typing import Any
 
+from minisplat_ref.extensions.cus import export
 from minisplat_ref.extensions.cus.method import ANCHORS, CUS
 from minisplat_ref.extensions.cus.stages import stages
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.studies.study import RESUMED_OUT, declare, iterations, seeds
 
 
 def save(path: str | Path, gaussians: Any, label: Label) -> None:
@@ -53,5 +54,19 @@ def save(path: str | Path, gaussians: Any, label: Label) -> None:
     save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
 
 
-EXTENSION = Extension("cus", recipes=(CUS,), representation=ANCHORS, save=save, stages=stages)
-"""The recipe ``cus`` with its renderer."""
+FLOATS = declare(
+    "floats",
+    "features from anchors against a query for each Gaussian, over floats",
+    f"{__name__}.study.run",
+    *(RESUMED_OUT, iterations(1000), seeds(3)),
+)
+EXTENSION = Extension(
+    "cus",
+    recipes=(CUS,),
+    representation=ANCHORS,
+    save=save,
+    stages=stages,
+    commands=(export,),
+    studies=(FLOATS,),
+)
+"""The recipe ``cus`` with its renderer, a command and a study."""

@@ -45,10 +45,10 @@ def remember(features: Iterable[Floats], similarity: float) -> Floats:
         units = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
         for begin in range(0, len(rows), CHUNK):
             part = units[begin : begin + CHUNK]
+            n_before = len(directions)
             cosines = part @ np.array(directions).T if directions else np.full((len(part), 1), -np.inf)
             for i in np.flatnonzero(cosines.max(axis=1) < similarity):
-                first = cosines.shape[1] if directions else 0
-                newer = directions[first:]
+                newer = directions[n_before:]
                 if len(kept) < ROWS_MAX and (not newer or (np.array(newer) @ part[i]).max() < similarity):
                     kept.append(rows[begin + i])
                     directions.append(part[i])

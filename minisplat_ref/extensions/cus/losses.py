@@ -58,7 +58,7 @@ def read_memory(queries: Floats, shared: Any) -> tuple[Floats, Reading]:
     return read(queries, memory, keys, adapter)
 
 
-def features(rendered: Rendered, *, features: str, samples: int) -> tuple[float, Cotangents]:
+def feature_loss(rendered: Rendered, *, features: str, samples: int) -> tuple[float, Cotangents]:
     """Compare features that the blended queries read with those of the photograph: ``L2 + (1 - cos)``.
 
     Photographs that are smaller than the classical bank's filters have none, and no error.

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.cus.decoding import Decoded, decode, decode_vjp
-from minisplat_ref.extensions.cus.losses import anchor_scale, features
+from minisplat_ref.extensions.cus.losses import anchor_scale, feature_loss
 from minisplat_ref.extensions.cus.population import ANCHOR_RATES, FIXED, UNITS, Anchors, as_anchors, initial_shared
 from minisplat_ref.mechanisms.networks.networks import networks_for
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -158,7 +158,7 @@ CUS = GS_ACCEL._replace(
     sh_milestones=(),
     losses=(
         *GS_ACCEL.losses,
-        LossTerm("features", partial(features, features="", samples=2_048), 0.1),
+        LossTerm("feature_loss", partial(feature_loss, features="", samples=2_048), 0.1),
         LossTerm("anchor_scale", anchor_scale, 0.01),
     ),
     events=(Every(1_000, partial(prune_insignificant, share=0.001), start=1_500, stop=15_000, min_gap=100),),
