@@ -14,7 +14,13 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cus import bank, maps, study
 from minisplat_ref.extensions.cus.decoding import decode
-from minisplat_ref.extensions.cus.losses import anchor_scale, blended_queries, blended_queries_vjp, drawn_pixels
+from minisplat_ref.extensions.cus.losses import (
+    anchor_scale,
+    blended_queries,
+    blended_queries_vjp,
+    drawn_pixels,
+    read_memory,
+)
 from minisplat_ref.extensions.cus.method import (
     ANCHORS,
     contributions_of,
@@ -24,6 +30,7 @@ from minisplat_ref.extensions.cus.method import (
 from minisplat_ref.extensions.cus.population import CAMERAS, Anchors, as_anchors
 from minisplat_ref.extensions.cus.stages import small, stages
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.mechanisms.features.blending import blend_channels
@@ -394,17 +401,19 @@ def test_a_file_says_that_it_lacks_the_network(run_folder, capfd):
     assert json.loads((run_folder / "metrics.json").read_text())["psnr"] == before
 
 
-def test_features_of_a_run_are_those_of_the_photographs(run_folder, tmp_path, capfd):
+def test_features_of_a_run_are_what_its_views_read(run_folder, tmp_path, capfd):
     assert main(["cus", "features", str(run_folder), "--out", str(tmp_path / "found")]) == 0
-    assert "channels, in" in capfd.readouterr().out
+    assert "3 channels, in" in capfd.readouterr().out
     names = sorted(path.stem for path in (tmp_path / "found").iterdir())
     assert names == sorted(path.stem for path in (run_folder.parent / "maps").iterdir())
-    found = np.stack([np.load(tmp_path / "found" / f"{name}.npy") for name in names])
-    given = np.stack([np.load(run_folder.parent / "maps" / f"{name}.npy") for name in names])
-    given = given.repeat(2, axis=1).repeat(2, axis=2)
-    assert found.shape == given.shape
-    spread = given[..., 0].std()
-    assert np.sqrt(np.mean((found[..., 0] - given[..., 0]) ** 2)) < spread  # better than the mean of all
+    with np.load(run_folder / "shared.npz") as stored:
+        model = Model(load_ply(run_folder / "point_cloud.ply", Anchors), dict(stored))
+    viewpoint = viewpoints.read(run_folder / "cameras.json")[1]
+    queries, _ = blended_queries(model, view_from(viewpoint.camera), Request())
+    found = np.load(tmp_path / "found" / f"{viewpoint.name}.npy")
+    expected, _ = read_memory(queries.reshape(-1, 3), model.shared)
+    assert_allclose(found, expected.reshape(40, 48, 3), atol=1e-6)
+    assert found[..., 0].std() > 1e-4
     for arguments, expected in (
         ([str(run_folder / "point_cloud.ply")], "a PLY alone has no memory"),
         ([str(run_folder)], "exists"),
@@ -428,13 +437,17 @@ def test_the_study_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "QUERIES", (1, 3))
     monkeypatch.setattr(study, "CUS", configure(find_recipe("cus"), **{**SMALL, "features": ""}))
     small_room = partial(make_scene, n_views=6, width=48, height=40, supersampling=1, n_points=60)
-    monkeypatch.setattr(study, "make_scene", small_room)
+    monkeypatch.setattr(study, "make_scene", lambda name, **size: small_room(name))
     monkeypatch.setattr(study, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
     words = ["study", "cus/floats", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "s")]
     assert main(words) == 0
     records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
-    assert [r["arm"] for r in records] == ["anchors, latent 2", "anchors, latent 3", "own queries, 1", "own queries, 3"]
-    n = records[0]["anchors"]
+    names = ["anchors, latent 2", "anchors, latent 3", "own queries, 1", "own queries, 3", "adaptive"]
+    assert [r["arm"] for r in records] == names
+    n = records[0]["gaussians"] // 2
     assert records[2]["floats"] == 2 * n and records[3]["floats"] == 6 * n
     assert records[1]["floats"] == 3 * n + (3 + 3 + 2) * 4 + 4 + 4 * 3 + 3 + 6 * 3 + 3
-    assert all(np.isfinite(r["error"]) and 0 <= r["iou"] <= 1 for r in records)
+    assert records[4]["all_floats"] == 59 * records[4]["gaussians"]
+    assert all(np.isfinite(r["error"]) and 0 <= r["iou"] <= 1 for r in records[:4])
+    assert records[1]["all_floats"] - records[0]["all_floats"] == n + 4 * 4  # four networks read one number more
+    assert "| adaptive " in capsys.readouterr().out

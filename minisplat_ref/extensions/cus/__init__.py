@@ -58,7 +58,7 @@ FLOATS = declare(
     "floats",
     "features from anchors against a query for each Gaussian, over floats",
     f"{__name__}.study.run",
-    *(RESUMED_OUT, iterations(1000), seeds(3)),
+    *(RESUMED_OUT, iterations(600), seeds(3)),
 )
 EXTENSION = Extension(
     "cus",

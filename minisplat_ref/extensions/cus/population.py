@@ -156,14 +156,15 @@ FIXED = dict.fromkeys(("means", "quats", "opacity_logits", "sh_dc", "sh_rest", M
 _RATE = LogLinear(2e-3, 2e-5, 30_000)
 RATES: Mapping[str, Any] = {
     **FIXED,
-    "latents": 7.5e-3,
+    "latents": 2e-2,
     "offsets": LogLinear(1.6e-4, 1.6e-6, 30_000),
     CAMERAS: LogLinear(1e-3, 1e-5, 30_000),
-    **{key: rate for name in (OPACITY, SHAPE, QUERY) for key, rate in network_rates(name, 2, _RATE).items()},
+    **{key: rate for name in (OPACITY, SHAPE) for key, rate in network_rates(name, 2, _RATE).items()},
     **network_rates(COLOR, 2, LogLinear(8e-3, 8e-5, 30_000)),
-    **network_rates(MIX, 1, _RATE),
-    KEYS: _RATE,
-    ADAPTER: _RATE,
+    **network_rates(QUERY, 2, LogLinear(5e-3, 5e-5, 30_000)),
+    **network_rates(MIX, 1, LogLinear(5e-3, 5e-5, 30_000)),
+    KEYS: LogLinear(1e-2, 1e-4, 30_000),
+    ADAPTER: LogLinear(1e-2, 1e-4, 30_000),
 }
 ANCHOR_RATES = Rates(RATES, frozenset({"offsets"}))
 UNITS = {**WORLD_UNITS, "offsets": Unit.LENGTH}
