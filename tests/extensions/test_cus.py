@@ -416,7 +416,7 @@ def test_features_of_a_run_are_what_its_views_read(run_folder, tmp_path, capfd):
     assert found[..., 0].std() > 1e-4
     for arguments, expected in (
         ([str(run_folder / "point_cloud.ply")], "a PLY alone has no memory"),
-        ([str(run_folder)], "exists"),
+        ([str(run_folder)], "already there"),
     ):
         assert main(["cus", "features", *arguments, "--out", str(tmp_path / "found")]) == 2
         assert expected in capfd.readouterr().err
