@@ -19,6 +19,7 @@ from minisplat_ref.extensions.cus.losses import (
     blended_queries,
     blended_queries_vjp,
     drawn_pixels,
+    feature_loss,
     read_memory,
 )
 from minisplat_ref.extensions.cus.method import (
@@ -28,7 +29,7 @@ from minisplat_ref.extensions.cus.method import (
     significance,
 )
 from minisplat_ref.extensions.cus.population import CAMERAS, Anchors, as_anchors
-from minisplat_ref.extensions.cus.stages import small, stages
+from minisplat_ref.extensions.cus.stages import N_CHANNELS, small, stages
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image
@@ -37,12 +38,14 @@ from minisplat_ref.mechanisms.features.blending import blend_channels
 from minisplat_ref.mechanisms.features.filters import CONSTANT
 from minisplat_ref.mechanisms.networks.mlp import Layer, to_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-from minisplat_ref.oracle.gradients import jacobian_case
+from minisplat_ref.oracle.differences import settled_derivative
+from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
+from minisplat_ref.oracle.loss_terms import loss_stage
 from minisplat_ref.oracle.models import noisy_model, training_view
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
 from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.losses import Rendered
+from minisplat_ref.training.losses import LossTerm, Rendered
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians, Model, RenderOutput, View, view_from
@@ -168,6 +171,18 @@ def test_gradients(number, rng):
     assert case.passed, case
 
 
+def test_the_gradient_of_the_feature_loss(rng, tmp_path):
+    """Along a random direction of everything on which it depends, with a given map and the mask of the check."""
+    setting = tiny_setting(GSPLAT_MAIN)
+    np.save(tmp_path / "a.npy", rng.normal(size=(7, 9, N_CHANNELS)))
+    term = LossTerm("feature_loss", partial(feature_loss, features=str(tmp_path), samples=30), 1.0)
+    stage = loss_stage(term, REFERENCE, setting, small(rng), rng)
+    read = {"latents", "offsets", "opacity_weights_0", "shape_biases_1", "query_weights_1", "memory", "adapter"}
+    assert read < stage.inputs.keys() and not any(name.startswith("color") for name in stage.inputs)
+    case = inner_product_case(stage, rng, settled_derivative)
+    assert case.passed, case
+
+
 def test_backends_agree(rng):
     view = training_view(make_camera())
     model, _ = noisy_model(tiny_setting(), view, small(rng), rng)
@@ -258,15 +273,16 @@ def test_classical_maps_know_the_direction_of_stripes():
     """Energies are channels 3 to 6 of the finest scale: the first is of waves along a row."""
     x = np.tile(np.arange(64), (48, 1))
     image = (255 * (0.5 + 0.5 * np.cos(2 * np.pi * x / 4.5)))[..., None].repeat(3, axis=2).astype(np.uint8)
-    energies = maps.feature_map(photograph(image), "")[24, 32, 3:7]
-    assert np.argmax(energies) == 0 and energies[0] > 3 * energies[2]
+    row = maps.feature_map(photograph(image), "")[24, 20:44, 3:7]
+    assert (np.argmax(row, axis=1) == 0).all() and (row[:, 0] > 3 * row[:, 2]).all()
+    assert np.ptp(row[:, 0]) < 0.2 * row[:, 0].mean()  # wherever in a stripe the pixel is
 
 
 def test_cells_of_a_coarse_map():
-    """Six columns of pixels over a map of two, and four rows over one of four."""
-    coarse = np.arange(8.0).reshape(4, 2, 1)
-    pixels = np.array([[0, 0], [0, 2], [0, 3], [3, 5]])
-    assert maps.at_pixels(coarse, pixels, 4, 6)[:, 0].tolist() == [0, 0, 1, 7]
+    """Six columns of pixels over a map of two, and five rows over two: the middle is the second."""
+    coarse = np.arange(4.0).reshape(2, 2, 1)
+    pixels = np.array([[0, 0], [1, 2], [1, 3], [2, 2], [4, 5]])
+    assert maps.at_pixels(coarse, pixels, 5, 6)[:, 0].tolist() == [0, 0, 1, 2, 3]
 
 
 def test_given_maps(tmp_path):
@@ -366,6 +382,13 @@ def test_the_least_significant_anchors_go(scene):
     prune_insignificant(state, iteration, share=1.5 / n)
     assert_array_equal(state.gaussians.means, rest)
     assert len(state.adam.first.latents) == n - 2
+    strong = len(rest) // 2  # the only one that photographs show well
+    state.gaussians.opacity_logits[:] = -4.0
+    state.gaussians.opacity_logits[strong] = 4.0
+    state.gaussians.log_scales[strong] += 1.0
+    prune_insignificant(state, iteration, share=(n - 3) / (n - 2))
+    assert_array_equal(state.gaussians.means, rest[[strong]])
+    assert prune_insignificant(state, iteration, share=0.5).startswith("nothing done")
 
 
 # Runs and the study
