@@ -134,6 +134,12 @@ def test_a_file_alone_shows_what_anchors_begin_with(rng):
     assert ours.image.tobytes() == theirs.image.tobytes()
 
 
+@pytest.mark.parametrize(("name", "value"), [("similarity", 1.5), ("hidden", 0), ("query", -1), ("embedding", 0)])
+def test_bad_settings(name, value, scene, rng):
+    with pytest.raises(InputError, match=f"{name}={value}"):
+        configure(find_recipe("cus"), **{name: value}).representation.shared(scene, rng)
+
+
 def test_an_unseen_photograph_has_the_mean_embedding(rng):
     model, _ = noisy_model(tiny_setting(), training_view(make_camera()), small(rng), rng)
     shared = {**model.shared, CAMERAS: np.array([[1.0, -2.0], [3.0, 4.0]])}

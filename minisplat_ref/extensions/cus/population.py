@@ -124,9 +124,16 @@ def initial_shared(
         Folder of feature maps; empty for the classical ones (:mod:`.maps`).
     similarity : float
         gamma: cosine from which on a feature counts as one that is remembered (:mod:`.bank`).
+
+    Raises
+    ------
+    InputError
+        A number is below 1, or the similarity no cosine; a map cannot be read, or has another depth than the others.
     """
     if min(hidden, embedding, query) < 1:
         raise InputError(f"hidden={hidden}, embedding={embedding} and query={query} are numbers from 1 on")
+    if not -1 < similarity <= 1:
+        raise InputError(f"similarity={similarity:g} is a cosine: give a number above -1, at most 1")
     (rng,) = rng.spawn(1)
     shared: dict[str, Floats] = {}
     for name, width in NETWORKS.items():
