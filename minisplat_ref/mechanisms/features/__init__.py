@@ -10,7 +10,7 @@ image. There are two:
 - :func:`~minisplat_ref.mechanisms.features.network.load_bank`: convolutions whose weights the user brings as an .npz.
   That module's docstring has the layout, and how VGG16's weights get into it.
 
-:mod:`minisplat_ref.mechanisms.features.blending` goes the other way: features of Gaussians, as many as there are, become
+:mod:`minisplat_ref.mechanisms.features.blending` goes the other way: any number of channels of Gaussians become
 those of pixels.
 
 The gradients of the layers are in :mod:`minisplat_ref.mechanisms.features.layers`; their forward functions are those of
