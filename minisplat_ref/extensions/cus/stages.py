@@ -27,7 +27,8 @@ from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
 CHILDREN, LATENT, HIDDEN, EMBEDDING, QUERY = 2, 2, 3, 2, 4
 N_REMEMBERED, N_CHANNELS = 3, 5
-SPREAD = 0.3  # of random weights and of the memory
+SPREAD = 0.5  # of random weights
+VOXEL = 8.0  # few anchors: among many, steps between thresholds are so small that they round
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
@@ -53,7 +54,7 @@ def small(rng: np.random.Generator) -> Representation:
         found = {name: array + SPREAD * rng.normal(size=array.shape) for name, array in found.items()}
         return {**found, **memory_of(rng)}
 
-    extend = partial(as_anchors, voxel=2.0, children=CHILDREN, latent=LATENT)
+    extend = partial(as_anchors, voxel=VOXEL, children=CHILDREN, latent=LATENT)
     return ANCHORS._replace(extend=extend, shared=shared, rates=Rates({"sh_rest": 0.0}, frozenset()))
 
 
