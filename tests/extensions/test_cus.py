@@ -461,6 +461,24 @@ def test_maps_of_different_depth_are_refused(run_folder, tmp_path, capfd):
     assert not (tmp_path / "no").exists()
 
 
+def test_features_of_another_recipe_are_refused(run_folder, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr("minisplat_ref.extensions.cus.method.CUS", find_recipe("cus")._replace(name="other"))
+    assert main(["cus", "features", str(run_folder), "--out", str(tmp_path / "no")]) == 2
+    assert "was trained by recipe cus, without features" in capfd.readouterr().err and not (tmp_path / "no").exists()
+
+
+def test_the_teacher_s_features_are_read_as_their_labels(scene, rng):
+    """Where one of an object's two pixels is taken for another's, one of three pixels that have either label agrees."""
+    directions = study.make_teacher(rng).directions
+    labels = np.array([[0, 1, 2, 3, 4], [0, 1, 2, 3, 4]])
+    view = scene.test_views[0]
+    task = study.Task(scene._replace(test_views=(view,)), "", [directions[labels]], [labels], 3 * directions)
+    right = study.quality(task, lambda view: directions[labels])
+    assert right["iou"] == 1 and abs(right["error"]) < 1e-5
+    half = study.quality(task, lambda view: directions[[[0, 1, 2, 3, 4], [0, 2, 3, 4, 1]]])
+    assert half["iou"] == pytest.approx(1 / 3) and half["error"] > 0.1
+
+
 def test_the_study_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "LATENTS", (2, 3))
     monkeypatch.setattr(study, "QUERIES", (1, 3))
