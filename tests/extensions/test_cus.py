@@ -142,8 +142,8 @@ def test_bad_settings(name, value, scene, rng):
 
 def test_an_unseen_photograph_has_the_mean_embedding(rng):
     model, _ = noisy_model(tiny_setting(), training_view(make_camera()), small(rng), rng)
-    shared = {**model.shared, CAMERAS: np.array([[1.0, -2.0], [3.0, 4.0]])}
-    mean = {**shared, CAMERAS: np.array([[2.0, 1.0]])}
+    shared = {**model.shared, CAMERAS: np.array([[1.0, -2.0, 0.5, 0.0], [3.0, 4.0, 0.5, 2.0]])}
+    mean = {**shared, CAMERAS: np.array([[2.0, 1.0, 0.5, 1.0]])}
     camera = make_camera()
     unseen = decode(model._replace(shared=shared), view_from(camera), IN_NUMPY).gaussians
     known = decode(model._replace(shared=mean), view_from(camera)._replace(view_id=0), IN_NUMPY).gaussians

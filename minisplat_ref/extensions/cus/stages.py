@@ -25,7 +25,7 @@ from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
-CHILDREN, LATENT, HIDDEN, EMBEDDING, QUERY = 2, 2, 3, 2, 4
+CHILDREN, LATENT, HIDDEN, EMBEDDING, QUERY = 2, 2, 3, 4, 4
 N_REMEMBERED, N_CHANNELS = 3, 5
 SPREAD = 0.5  # of random weights
 VOXEL = 8.0  # few anchors: among many, steps between thresholds are so small that they round

@@ -39,7 +39,7 @@ from minisplat_ref.rendering import RenderSettings, Request, activate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.studies import kit
-from minisplat_ref.studies.figures import summarise, with_deviation
+from minisplat_ref.studies.figures import set_ticks, summarise, with_deviation
 from minisplat_ref.studies.objects import OBJECTS, mean_iou, object_ids
 from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
 from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
@@ -264,5 +264,7 @@ def draw(records: list[dict[str, Any]]) -> Figure:
             ]
             axes.plot(*points, "o-", color=color, label=start)
         axes.set(xlabel="floats of the features", ylabel=label, xscale="log")
+        ticks = sorted({int(line) for arm in axes.lines for line in arm.get_xdata()})
+        set_ticks(axes, ticks[1::2], [f"{tick / 1e3:.0f}k" for tick in ticks[1::2]])
         axes.legend()
     return figure
