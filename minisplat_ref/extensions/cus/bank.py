@@ -4,7 +4,7 @@ The memory M [K, D] keeps a feature r of the photographs, one after the other, i
 
     max_k (r . m_k) / (|r| |m_k|) < gamma
 
-A blended query q [d] reads it by attention, and an adapter W [D, D] has the last word::
+A blended query q [d] reads it by attention, and an adapter W [D, D] maps what was read::
 
     a = softmax(q (M P)^T / sqrt(d)),   f = (a M) W
 
