@@ -29,10 +29,10 @@ the anchors, which other viewers show as one Gaussian each.
 
 This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical, and
 nothing is said of meaning. Networks add to what an anchor begins with, which is the colour of its points; their last
-layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points, instead of 0.01. Queries have 15 numbers
-instead of 160, and keys are as wide. The terms of the significance have different units and are divided by their means
-first; the gradient is Adam's running mean. Dates of pruning, weights, gamma and rates are ours. The features of 2,048
-pixels are compared in an iteration, drawn at random.
+layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points, instead of
+0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have different units
+and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights, gamma and rates
+are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
 
 Left out: the growing of anchors, and the language model.
 """
