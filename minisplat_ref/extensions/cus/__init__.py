@@ -40,7 +40,7 @@ Left out: the growing of anchors, and the language model.
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.extensions.cus import export
+from minisplat_ref.extensions.cus import features
 from minisplat_ref.extensions.cus.method import ANCHORS, CUS
 from minisplat_ref.extensions.cus.stages import stages
 from minisplat_ref.extensions.extension import Extension
@@ -66,7 +66,7 @@ EXTENSION = Extension(
     representation=ANCHORS,
     save=save,
     stages=stages,
-    commands=(export,),
+    commands=(features,),
     studies=(FLOATS,),
 )
 """The recipe ``cus`` with its renderer, a command and a study."""
