@@ -169,6 +169,11 @@ ORDER = (
                 (25,),
                 "features of images; a scene in the style of an image",
             ),
+            Step(
+                ("extensions/cus/",),
+                (),
+                "voxels that networks decode to Gaussians, and a memory in which pixels read features",
+            ),
             Step(("extensions/segment/",), (25,), "labels of Gaussians from masks of photographs, by a vote"),
             Step(("extensions/satellite/",), (), "affine cameras of satellites, the sun's shadows, surface models"),
             Step(

@@ -578,6 +578,46 @@ TABLES["lucas-kanade"] = GS_ACCEL | rows(
     per_extent=["means", "warp_centers", "warp_shifts"],
 )
 
+TABLES["cus"] = {
+    **{name: row for name, row in GS_ACCEL.items() if not name.startswith(DENSITY_CONTROL)},
+    **rows(
+        "CUS-GS: the 10 Gaussians and the latent of a voxel, the share that is pruned",
+        extend__children=10,
+        extend__latent=32,
+        prune_insignificant__share=0.001,
+    ),
+    **rows(
+        f"{OURS}: voxels as large as the points are apart; what is not trained; weights, rates and dates",
+        extend__voxel=1.0,
+        sh_degree=(0,),
+        feature_loss=(0.1, 1),
+        feature_loss__features="",
+        feature_loss__samples=2_048,
+        anchor_scale=(0.01, 1),
+        prune_insignificant=[steps(2_000, 14_000, 1_000)],
+        prune_insignificant__min_gap=100,
+        rate__latents=2e-2,
+        rate__offsets=(1.6e-4, 1.6e-6, 30_000),
+        rate__camera_embeddings=(1e-3, 1e-5, 30_000),
+        rate__memory_keys=(1e-2, 1e-4, 30_000),
+        rate__adapter=(1e-2, 1e-4, 30_000),
+        per_extent=["means", "offsets"],
+        **{f"rate__{name}": 0.0 for name in ("means", "quats", "opacity_logits", "sh_dc", "sh_rest", "memory")},
+        **{
+            f"rate__{name}_{kind}_{k}": (rate, rate / 100, 30_000)
+            for name, rate in (
+                ("opacity", 2e-3),
+                ("shape", 2e-3),
+                ("color", 8e-3),
+                ("query", 5e-3),
+                ("query_mix", 5e-3),
+            )
+            for kind in ("weights", "biases")
+            for k in range(1 if name == "query_mix" else 2)
+        },
+    ),
+}
+
 CONSTANTS = [
     ("games.faces", "THINNESS", 1e-3, f"{OURS}: the paper has a constant near zero, of no unit"),
     ("antialiasing.method", "EPS2D", 0.1, "Mip-Splatting, released code"),
@@ -596,6 +636,9 @@ CONSTANTS = [
     ("omg.population", "HIDDEN", 64, "OMG, hidden layers"),
     ("polygons.method", "LOG_THICKNESS", np.log(1e-5), "REdiSplats, released code"),
     ("mixed.population", "COLOR_DISTANCE", 5.0, "MP-GS, the distance of like colours in Lab"),
+    ("cus.method", "LARGE", 0.9, f"{OURS}: the paper says that volumes are normalised"),
+    ("cus.losses", "UNIT", 0.01, "CUS-GS, the side of a voxel"),
+    ("cus.bank", "ROWS_MAX", 512, f"{OURS}: a memory for a CPU"),
     ("rays.lights", "BOUNCES_MAX", 3, "RaySplats, section 3.3"),
     ("rays.surroundings", "INDEX", 1.5, "of window glass"),
     ("lucas_kanade.pyramid", "WINDOW", 2.0, f"{OURS}: pixels"),

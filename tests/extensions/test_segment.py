@@ -312,7 +312,7 @@ def test_masks_are_shifted_and_lost():
 
 
 def test_iou_by_hand(monkeypatch):
-    monkeypatch.setattr(study, "OBJECTS", ((1,), (2,)))
+    monkeypatch.setattr("minisplat_ref.studies.objects.OBJECTS", ((1,), (2,)))
     truth, found = np.array([[1, 1, 2, 0]]), np.array([[1, 2, 2, 2]])
     assert study.mean_iou([found], [truth]) == pytest.approx((1 / 2 + 1 / 3) / 2)
 

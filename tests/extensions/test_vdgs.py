@@ -23,8 +23,6 @@ from minisplat_ref.extensions.vdgs.method import (
     n_outputs,
 )
 from minisplat_ref.extensions.vdgs.reference import (
-    directions,
-    directions_vjp,
     modulate,
     modulate_vjp,
     modulated_logits,
@@ -32,6 +30,7 @@ from minisplat_ref.extensions.vdgs.reference import (
 )
 from minisplat_ref.extensions.vdgs.stages import MODES, small_shared, stages
 from minisplat_ref.io.ply import load_ply, read_label
+from minisplat_ref.mechanisms.networks.directions import directions, directions_vjp
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.gradients import jacobian_case

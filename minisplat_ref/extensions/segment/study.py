@@ -21,9 +21,9 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import SERIES
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_deviations, with_deviation
+from minisplat_ref.studies.objects import OBJECTS, mean_iou, object_ids
 from minisplat_ref.types import Gaussians, Ints
 
-OBJECTS = ((37,), (38,), (26,), (6, 7))  # primitives of the room: crate, ball, globe, picture; labels are 1, 2, 3, 4
 BIASES = (-0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6)
 SHIFTS = (3, 5)  # pixels, the least and the most along each axis
 CONDITIONS = {
@@ -70,14 +70,6 @@ def measure(made: SyntheticScene, gaussians: Gaussians, seed: int) -> list[dict[
     return records
 
 
-def object_ids(primitives: Ints) -> Ints:
-    """Return the labels [H, W] of an image of primitives."""
-    ids = np.zeros(primitives.shape, np.int64)
-    for label, own in enumerate(OBJECTS, start=1):
-        ids[np.isin(primitives, own)] = label
-    return ids
-
-
 def spoil(masks: list[Ints], shifted: float, lost: float, rng: np.random.Generator) -> list[Ints]:
     """Return masks of which shares, at random and rounded, are shifted along both axes, or show no object."""
     order = rng.permutation(len(masks))
@@ -99,16 +91,6 @@ def shift(mask: Ints, y: int, x: int) -> Ints:
         max(-y, 0) : height + min(-y, 0), max(-x, 0) : width + min(-x, 0)
     ]
     return moved
-
-
-def mean_iou(drawn: list[Ints], truth: list[Ints]) -> float:
-    """Return intersection over union of each object over all views together, and of these the mean."""
-    found, true = np.stack(drawn), np.stack(truth)
-    shares = []
-    for label in range(1, 1 + len(OBJECTS)):
-        either = np.count_nonzero((found == label) | (true == label))
-        shares.append(np.count_nonzero((found == label) & (true == label)) / either if either else 1.0)
-    return float(np.mean(shares))
 
 
 def _of(records: list[dict[str, Any]], masks: str, bias: float) -> list[float]:

@@ -16,8 +16,6 @@ import numpy as np
 from minisplat_ref.extensions.vdgs.modes import Mode, opacity_times
 from minisplat_ref.extensions.vdgs.reference import (
     Opacities,
-    directions,
-    directions_vjp,
     modulate,
     modulate_vjp,
     modulated_logits,
@@ -25,6 +23,7 @@ from minisplat_ref.extensions.vdgs.reference import (
 )
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.networks.contraction import contract, contract_vjp
+from minisplat_ref.mechanisms.networks.directions import directions, directions_vjp
 from minisplat_ref.mechanisms.networks.hash_grid import Levels, make_levels, make_table
 from minisplat_ref.mechanisms.networks.mlp import Layer, from_shared, make_network, network_rates, to_shared
 from minisplat_ref.mechanisms.networks.networks import Networks, networks_for

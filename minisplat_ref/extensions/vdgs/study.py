@@ -25,7 +25,7 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT, as_seen
-from minisplat_ref.extensions.vdgs.reference import directions
+from minisplat_ref.mechanisms.networks.directions import directions
 from minisplat_ref.mechanisms.networks.networks import COMPILED
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate

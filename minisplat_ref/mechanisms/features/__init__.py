@@ -1,4 +1,4 @@
-"""Features of images: maps of filter responses, each with its gradient, for losses that compare textures.
+"""Features of images: maps of filter responses, each with its gradient, and channels that Gaussians blend.
 
 A :class:`~minisplat_ref.mechanisms.features.bank.FeatureBank` is a pair of functions: ``features(image)`` returns maps
 [h, w, C], from fine to coarse, and a tape; ``features_vjp(tape, v_maps)`` returns the gradient with respect to the
@@ -9,6 +9,9 @@ image. There are two:
   colours, not shapes or objects.
 - :func:`~minisplat_ref.mechanisms.features.network.load_bank`: convolutions whose weights the user brings as an .npz.
   That module's docstring has the layout, and how VGG16's weights get into it.
+
+:mod:`minisplat_ref.mechanisms.features.blending` goes the other way: any number of channels of Gaussians become
+those of pixels.
 
 The gradients of the layers are in :mod:`minisplat_ref.mechanisms.features.layers`; their forward functions are those of
 LPIPS (:mod:`minisplat_ref.lpips`).

@@ -4,6 +4,7 @@
 :mod:`.mlp`            `.mlp_kernels`      fully connected layers with (leaky) ReLUs between them
 :mod:`.fourier`        `.fourier_kernels`  sines and cosines of octaves
 :mod:`.hash_grid`      `.hash_kernels`     features at the vertices of grids, in tables that hash the vertices
+:mod:`.directions`                         directions from which a camera sees points
 :mod:`.contraction`                        space in a ball, for encodings that need a bounded input
 =====================  ==================  ====================================================================
 

@@ -1,0 +1,72 @@
+"""CUS-GS: voxels that decode several Gaussians each, and read their features in a memory.
+
+This follows CUS-GS, 2025, arXiv 2511.17904. What 3DGS stores for each Gaussian, and feature fields store once more,
+an anchor stores for the K Gaussians of a voxel: a latent z of few numbers and their offsets. Networks that all anchors
+share make of it opacity, scales, rotation, colour and a query (:mod:`.decoding`):
+
+    mu_n = m + dx_n,   (o, s, q, c)_n = networks(z, d, e),   k_n = [query(z, d, e), dx_n / s] A + b
+
+with the direction d of view and an embedding e of the photograph. Queries are blended as colours are, and a pixel reads
+its feature in a memory M of the photographs' features, each unlike the others (:mod:`.bank`):
+
+    f = softmax(k (M P)^T / sqrt(dim)) M W
+
+The loss is that of 3DGS, with 0.1 (L2 + 1 - cos) of the features and 0.01 times the mean volume of anchors
+(:mod:`.losses`). Every thousand iterations the 0.1 % of anchors with the least significance go (:mod:`.method`):
+
+    S = 2 |z| + 8 |dL/dz| + sum_n hits_n o_n V_n
+
+    minisplat-ref train SCENE --recipe cus --out runs/anchors
+    minisplat-ref train SCENE --recipe cus --set features=DIR --out runs/anchors
+    minisplat-ref cus features runs/anchors --out maps
+    minisplat-ref study cus/floats --out DIR
+    minisplat-ref oracle gradients --extension cus
+
+``features=DIR`` has a map for each photograph, ``NAME.npy`` or ``NAME.npz`` of [h, w, D], of whatever network; without
+it maps are classical: colours and the energies of Gabor filters at three scales, 22 numbers (:mod:`.maps`).
+``docs/FAMILY.md`` has the measured figures. A run keeps networks, embeddings and memory in ``shared.npz``; a PLY has
+the anchors, which other viewers show as one Gaussian each.
+
+This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical, and
+nothing is said of meaning. Networks add to what an anchor begins with, which is the colour of its points; their last
+layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points, instead of
+0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have different units
+and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights, gamma and rates
+are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
+
+Left out: the growing of anchors, and the language model.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.extensions.cus import features
+from minisplat_ref.extensions.cus.method import ANCHORS, CUS
+from minisplat_ref.extensions.cus.stages import stages
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.io.label import Label
+from minisplat_ref.io.ply import save_ply
+from minisplat_ref.studies.study import RESUMED_OUT, declare, iterations, seeds
+
+
+def save(path: str | Path, gaussians: Any, label: Label) -> None:
+    """Write the anchors, and say in the header that the networks are missing."""
+    save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
+
+
+FLOATS = declare(
+    "floats",
+    "features from anchors against a query for each Gaussian, over floats",
+    f"{__name__}.study.run",
+    *(RESUMED_OUT, iterations(600), seeds(3)),
+)
+EXTENSION = Extension(
+    "cus",
+    recipes=(CUS,),
+    representation=ANCHORS,
+    save=save,
+    stages=stages,
+    commands=(features,),
+    studies=(FLOATS,),
+)
+"""The recipe ``cus`` with its renderer, a command and a study."""
