@@ -32,6 +32,11 @@ class Coarse(NamedTuple):
     render_settings: RenderSettings
     frame: Frame
 
+    @property
+    def means(self) -> Floats:
+        """[N, 3] centres, in the frame of the files, float64."""
+        return return_points(self.model.gaussians.means, self.frame)
+
 
 def cover(coarse: Coarse, scene: Scene, plane: Plane, blocks: Sequence[Block]) -> Coverage:
     """Assign photographs to blocks.
@@ -53,7 +58,7 @@ def cover(coarse: Coarse, scene: Scene, plane: Plane, blocks: Sequence[Block]) -
     InputError
         A block has fewer than two photographs.
     """
-    coordinates = plane.coordinates(return_points(coarse.model.gaussians.means, coarse.frame))  # [N, 2]
+    coordinates = plane.coordinates(coarse.means)  # [N, 2]
     in_region = np.stack([block.region.contains(coordinates) for block in blocks])  # [B, N]
     masks: list[dict[str, Bools]] = [{} for _ in blocks]
     n_trained = n_shown = 0

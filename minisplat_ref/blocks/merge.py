@@ -1,7 +1,5 @@
 """Phase 4: the Gaussians of all blocks, each from the block in whose core it lies, as an ordinary run."""
 
-from pathlib import Path
-
 import numpy as np
 
 from minisplat_ref.blocks.plan import COARSE, Asked, Plan, Planned
@@ -75,8 +73,3 @@ def write_history(asked: Asked, plan: Plan, state: TrainState) -> None:
         **{key: sum(record[key] for record in (coarse[-1], *last)) for key in ("seconds", "cpu_seconds")},
     }
     write_log(asked.folder / run_folder.LOG, [*(record for record in coarse if record["step"] < state.step), end])
-
-
-def is_merged(folder: Path) -> bool:
-    """Return whether the run of the whole is there; it is measured last."""
-    return (folder / run_folder.METRICS).exists()

@@ -23,13 +23,12 @@ from minisplat_ref.blocks.coverage import Coarse, cover
 from minisplat_ref.blocks.grid import Block, divide, ground_plane
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.frames import return_camera, return_points
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.part import Part, Plane, box_from_json
 from minisplat_ref.runs.scoring import renderer_of
-from minisplat_ref.runs.settings import Settings, load, load_frame, load_model, recipe_of
-from minisplat_ref.types import Scene
+from minisplat_ref.runs.settings import Settings, load, load_model, recipe_of
+from minisplat_ref.types import Floats, Scene
 
 PLAN = "plan.json"
 COARSE = "coarse"
@@ -126,7 +125,7 @@ def load_asked(folder: Path) -> Asked:
     return Asked(folder, load(folder / run_folder.BLOCKS), (shape[0], shape[1]))
 
 
-def make_plan(asked: Asked, scene: Scene) -> Plan:
+def make_plan(asked: Asked, scene: Scene, coarse: Coarse, centers: Floats) -> Plan:
     """Plan by the coarse model, and write the parts of all blocks.
 
     Parameters
@@ -134,24 +133,25 @@ def make_plan(asked: Asked, scene: Scene) -> Plan:
     asked : Asked
     scene : Scene
         Of the coarse training, in its frame.
+    coarse : Coarse
+        Its model.
+    centers : ndarray of shape (V, 3)
+        Of the training cameras, in the frame of the files.
 
     Raises
     ------
     InputError
         The cameras cannot be divided so, or a block has too few photographs.
     """
-    frame = load_frame(asked.run_folder_of(COARSE))
-    centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])  # [V, 3]
     plane = ground_plane(centers)
     blocks = divide(plane.coordinates(centers), asked.shape)
-    coarse = _coarse(asked, scene)
     masks, trained = cover(coarse, scene, plane, blocks)
     for block, own in zip(blocks, masks, strict=True):
         Part(plane, block.region, own).write(asked.blocks_folder / f"{block.name}.json")
     n_views, cooling = len(scene.train_views), recipe_of(asked.settings).cooling
     whole = asked.settings.iterations
     gaussians = coarse.model.gaussians
-    places = plane.coordinates(return_points(gaussians.means, frame))  # [N, 2]
+    places = plane.coordinates(coarse.means)  # [N, 2]
     planned = []
     for block, own in zip(blocks, masks, strict=True):
         n_iterations = whole if cooling is not None else max(1, round(whole * len(own) / n_views))
@@ -181,7 +181,8 @@ def save_plan(asked: Asked, plan: Plan) -> None:
     run_folder.write_json(asked.folder / PLAN, to_json(asked, plan))
 
 
-def _coarse(asked: Asked, scene: Scene) -> Coarse:
+def load_coarse(asked: Asked, scene: Scene) -> Coarse:
+    """Read the coarse model, and how it is drawn before the scene's background."""
     folder, settings = asked.run_folder_of(COARSE), asked.coarse
     model = load_model(folder, settings)
     conventions, backend = PROFILES[settings.profile], get_backend(settings.backend)

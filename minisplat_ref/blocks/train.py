@@ -19,17 +19,18 @@ from minisplat_ref.blocks.plan import (
     Plan,
     describe,
     load_asked,
+    load_coarse,
     load_plan,
     make_plan,
     save_plan,
     too_large,
 )
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.frames import return_camera, return_points
+from minisplat_ref.io.frames import return_camera
 from minisplat_ref.memory import free_bytes
 from minisplat_ref.runs.cluster import Workers, carry_out_all
 from minisplat_ref.runs.run_folder import BLOCK_PLAN, has_begun
-from minisplat_ref.runs.settings import Settings, load_frame, load_model, load_photographs, recipe_of
+from minisplat_ref.runs.settings import Settings, load_frame, load_photographs, recipe_of
 from minisplat_ref.runs.trainings import HEADINGS, status_of, train_here, words_of, words_to_end
 from minisplat_ref.runs.worker import Job
 from minisplat_ref.training.schedule import Recipe
@@ -80,13 +81,12 @@ def plan_blocks(asked: Asked) -> Plan:
     plan = load_plan(asked.folder)
     if plan is not None:
         return plan
-    folder = asked.run_folder_of(COARSE)
-    frame = load_frame(folder)
+    frame = load_frame(asked.run_folder_of(COARSE))
     scene = load_photographs(asked.coarse, frame)
-    plan = make_plan(asked, scene)
-    centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])
-    means = load_model(folder, asked.coarse).gaussians.means
-    draw_plan(plan, centers, return_points(means, frame), asked.folder / BLOCK_PLAN)
+    coarse = load_coarse(asked, scene)
+    centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])  # [V, 3]
+    plan = make_plan(asked, scene, coarse, centers)
+    draw_plan(plan, centers, coarse.means, asked.folder / BLOCK_PLAN)
     save_plan(asked, plan)
     print(describe(asked, plan))
     return plan
@@ -116,6 +116,7 @@ def is_unfinished(folder: Path) -> bool:
 
 
 def _train(asked: Asked, trainings: dict[str, Settings], workers: Workers) -> int:
+    """Take trainings to their ends, in turn or by workers; return the exit code."""
     jobs, folder = [], asked.folder.resolve()
     for name, settings in trainings.items():
         run = asked.run_folder_of(name)
@@ -123,14 +124,13 @@ def _train(asked: Asked, trainings: dict[str, Settings], workers: Workers) -> in
         print(f"{_title(name)}, {settings.iterations} iterations{HEADINGS[status]}", flush=True)
         if status == "finished":
             continue
-        if not workers.is_used:
-            words = words_to_end(run, settings, words_of(settings, run))
-            code = 0 if words is None else train_here(words)
-            if code != 0:
-                return code
-        jobs.append(Job(_title(name), next_words, (folder, name), folder / run.relative_to(asked.folder)))
-    if not workers.is_used:
-        return 0
+        if workers.is_used:
+            jobs.append(Job(_title(name), next_words, (folder, name), run.resolve()))
+            continue
+        words = words_to_end(run, settings, words_of(settings, run))
+        code = 0 if words is None else train_here(words)
+        if code != 0:
+            return code
     inputs = [Path(asked.settings.scene)]
     return carry_out_all(workers, jobs, folder, inputs, lambda job: print(f"{job.name}: ended", flush=True))
 

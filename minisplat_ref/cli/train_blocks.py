@@ -27,8 +27,6 @@ WHOLE_ONLY = {
 }
 """Options that a training in blocks refuses, and what to do or why."""
 
-INTERRUPTED = 130
-
 
 def refuse_options(given: dict[str, Any]) -> None:
     """Refuse options of a training of the whole."""
@@ -62,6 +60,7 @@ def start(asked: "Asked", recipe: "Recipe", scene: "Scene", state: "TrainState")
 def go_on(asked: "Asked", workers: "Workers") -> "tuple[Scene, Recipe, TrainState] | int":
     """Do what is left of the four phases; return what the run of the whole ends with, or an exit code."""
     from minisplat_ref.blocks.train import merged, plan_blocks, train_blocks, train_coarse
+    from minisplat_ref.runs.worker import INTERRUPTED
 
     try:
         code = train_coarse(asked, workers)

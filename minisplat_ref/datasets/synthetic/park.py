@@ -23,7 +23,6 @@ LANE = 1.0  # metres between lanes
 EYES = (1.5, 2.1)  # metres, height of the camera
 AHEAD = 2.2  # metres on the ground, to where the camera looks
 N_THINGS = 7  # in a square
-N_PALETTES = 6  # looks of things; with place and size no two things are alike
 
 
 class Walk(NamedTuple):
@@ -89,7 +88,7 @@ def _square(corner: Floats, looks: list[Texture], rng: np.random.Generator) -> l
     things = []
     for cell in cells.tolist():
         x, y = corner + SIDE * (np.array(divmod(cell, 3)) + 0.5 + rng.uniform(-0.18, 0.18, 2)) / 3
-        look = looks[rng.integers(N_PALETTES)]
+        look = looks[rng.integers(len(looks))]
         size, kind = rng.uniform(0.2, 0.45), rng.integers(3)
         if kind == 0:
             things.append(place(Sphere(size), look, [x, y, 0.7 * size], rotate_z(rng.uniform(0, 180))))
