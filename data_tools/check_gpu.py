@@ -172,6 +172,25 @@ def time_passes(passes: Passes, repeats: int) -> dict[str, float]:
     return {"forward_ms": forward, "backward_ms": median_ms(lambda: passes.backward(tape), synchronize, repeats)}
 
 
+def time_stages(passes: Passes, repeats: int) -> dict[str, float]:
+    """Time the stages of a view one by one, in ms; between two of them the host waits for the device."""
+    b, g, camera = passes.backend, passes.gaussians, passes.camera
+    tape = passes.forward()
+    primitives: Primitives = tape[0]
+    _, p, colors, bins, output = tape
+    grid, no_alpha = bins.grid, passes.device.zeros(output.alpha.shape, np.float32)
+    blended = p, colors, passes.background, bins, GSPLAT_MAIN
+    harmonics = g.means, g.sh_dc, g.sh_rest, camera, 3, p.radii
+    stages: dict[str, Callable[[], Any]] = {
+        "project": lambda: b.project(*primitives, camera, GSPLAT_MAIN),
+        "colours": lambda: b.sh_colors(*harmonics),
+        "lists": lambda: b.bin_gaussians(p, grid, GSPLAT_MAIN),
+        "blend": lambda: b.composite(*blended),
+        "blend_vjp": lambda: b.composite_vjp(*blended, output, output.image, no_alpha),
+    }
+    return {name: median_ms(stage, passes.device.synchronize, repeats) for name, stage in stages.items()}
+
+
 def time_gsplat(n: int, size: tuple[int, int], repeats: int) -> dict[str, Any]:
     """Time gsplat's kernels on the same view, or say why not."""
     try:
@@ -221,7 +240,9 @@ def run_speed(args: argparse.Namespace, backends: tuple[Backend, ...]) -> dict[s
         return {"not_timed": "the simulator's times say nothing"}
     view = args.gaussians, args.size
     ours = {backend.name: time_passes(Passes(backend, *view), args.repeats) for backend in backends}
-    return {"n_gaussians": view[0], "size": list(view[1]), **ours, "gsplat": time_gsplat(*view, args.repeats)}
+    stages = time_stages(Passes(backends[0], *view), args.repeats)
+    others = {"stages_ms": stages, "gsplat": time_gsplat(*view, args.repeats)}
+    return {"n_gaussians": view[0], "size": list(view[1]), **ours, **others}
 
 
 def failures(found: dict[str, Any]) -> list[str]:

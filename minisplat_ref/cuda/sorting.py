@@ -1,8 +1,9 @@
-"""The one sort of a view: pairs (tile, Gaussian) by tile, and within a tile by depth, by a radix sort.
+"""A stable radix sort of keys with their values: of Gaussians by depth, and of their pairs by tile.
 
-A pass sorts by one digit of four bits and keeps the order of equal ones; digits come from the last to the first. A
-thread has 32 consecutive pairs: it counts their digits, the counts are scanned digit by digit, and it writes its pairs
-from there on in their order. So there are no atomic operations, and the order is that of any stable sort.
+A pass sorts by one digit of six bits and keeps the order of equal ones; digits come from the last to the first. A
+block has 2048 consecutive keys and each of its threads 16 of them. They count their digits in shared memory; the
+blocks' counts are scanned digit by digit; and each thread writes its keys from where those of the threads before it
+end, in their order. So there are no atomic operations, and the order is that of any stable sort.
 """
 
 from typing import Any
@@ -11,79 +12,107 @@ import numpy as np
 
 from minisplat_ref.cuda.arrays import empty
 from minisplat_ref.cuda.scanning import exclusive_sums
-from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch_rows
+from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch, launch_rows
 
-CHUNK = 32  # pairs of a thread
-DIGIT_BITS = 4
+DIGIT_BITS = 6
 N_DIGITS = 1 << DIGIT_BITS
+THREADS = 128  # of a block
+KEYS = 16  # of a thread
+BLOCK_KEYS = THREADS * KEYS
 
 
 @gpu_kernel
 def write_order(order):
-    """Write the order before the first pass."""
+    """Write 0, 1, 2, ...: the order before a sort."""
     i = cuda.grid(1)
     if i < order.shape[0]:
         order[i] = i
 
 
 @device_function
-def digit_of(keys, pair, shift):
+def digit_of(keys, i, shift):
     """Return a digit of a key."""
-    return (keys[pair] >> shift) & (N_DIGITS - 1)
+    return (keys[i] >> shift) & (N_DIGITS - 1)
 
 
-@gpu_kernel
-def count_digits(keys, order, shift, counts):
-    """Write how often each digit occurs in one chunk, to ``counts`` [16 * chunks], digit after digit."""
-    chunk, n = cuda.grid(1), order.shape[0]
-    n_chunks = counts.shape[0] // N_DIGITS
-    if chunk >= n_chunks:
-        return
+@device_function
+def count_own(keys, shift, counts):
+    """Count the digits of the thread's keys in its column of ``counts`` [64, threads]; return where they lie."""
+    thread = cuda.threadIdx.x
+    first = cuda.blockIdx.x * BLOCK_KEYS + thread * KEYS
+    end = min(first + KEYS, keys.shape[0])
     for digit in range(N_DIGITS):
-        counts[digit * n_chunks + chunk] = 0
-    for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, n)):
-        counts[digit_of(keys, order[i], shift) * n_chunks + chunk] += 1
+        counts[digit, thread] = 0
+    for i in range(first, end):
+        counts[digit_of(keys, i, shift), thread] += 1
+    cuda.syncthreads()
+    return first, end
 
 
 @gpu_kernel
-def move_pairs(keys, order, shift, places, moved):
-    """Write the pairs of one chunk to their places, which ``places`` [16 * chunks + 1] counts on."""
-    chunk, n = cuda.grid(1), order.shape[0]
-    n_chunks = (places.shape[0] - 1) // N_DIGITS
-    if chunk >= n_chunks:
-        return
-    for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, n)):
-        pair = order[i]
-        k = digit_of(keys, pair, shift) * n_chunks + chunk
-        moved[places[k]] = pair
-        places[k] += 1
+def count_digits(keys, shift, totals):
+    """Write how often each digit occurs in one block, to ``totals`` [64 * blocks], digit after digit."""
+    counts = cuda.shared.array((N_DIGITS, THREADS), np.int32)
+    count_own(keys, shift, counts)
+    digit = cuda.threadIdx.x
+    if digit < N_DIGITS:
+        total = np.int32(0)
+        for thread in range(THREADS):
+            total += counts[digit, thread]
+        totals[digit * cuda.gridDim.x + cuda.blockIdx.x] = total
 
 
-def sort_pairs(tiles: Any, depth_bits: Any, n_tiles: int) -> Any:
-    """Return the order of the pairs by (tile, depth); equal ones keep their order.
+@gpu_kernel
+def move_keys(keys, values, shift, starts, sorted_keys, sorted_values):
+    """Write the keys of one block and their values to their places, from ``starts`` [64 * blocks + 1] on."""
+    places = cuda.shared.array((N_DIGITS, THREADS), np.int32)
+    first, end = count_own(keys, shift, places)
+    digit = cuda.threadIdx.x
+    if digit < N_DIGITS:
+        place = np.int32(starts[digit * cuda.gridDim.x + cuda.blockIdx.x])
+        for thread in range(THREADS):
+            count = places[digit, thread]
+            places[digit, thread] = place
+            place += count
+    cuda.syncthreads()
+    for i in range(first, end):
+        own = digit_of(keys, i, shift)
+        place = places[own, cuda.threadIdx.x]
+        sorted_keys[place], sorted_values[place] = keys[i], values[i]
+        places[own, cuda.threadIdx.x] = place + 1
+
+
+def order_of(n: int) -> Any:
+    """Return the numbers from 0 to ``n`` - 1, int32 on the device."""
+    order = empty(n, np.int32)
+    launch_rows(write_order, n, order)
+    return order
+
+
+def sort_by_key(keys: Any, values: Any, n_bits: int) -> tuple[Any, Any]:
+    """Sort keys and, with them, their values; equal keys keep their order.
 
     Parameters
     ----------
-    tiles : device array of shape (M,) of int32
-        Tile of each pair, below ``n_tiles``.
-    depth_bits : device array of shape (M,) of int32 or int64
-        Bits of the Gaussian's depth as an integer: positive floats are ordered as their bits are.
-    n_tiles : int
+    keys : device array of shape (M,) of int32 or int64
+        Not negative. They and ``values`` are overwritten.
+    values : device array of shape (M,) of int32
+    n_bits : int
+        Every key is below 2 to the power of it.
 
     Returns
     -------
-    device array of shape (M,) of int32
-        Index of the pair that comes first, of the second, and so on.
+    sorted keys, sorted values
+        Of the same shapes and dtypes.
     """
-    n, n_chunks = len(tiles), -(-len(tiles) // CHUNK)
-    order, moved = empty(n, np.int32), empty(n, np.int32)
+    n, n_blocks = len(keys), -(-len(keys) // BLOCK_KEYS)
     if n == 0:
-        return order
-    counts = empty(N_DIGITS * n_chunks, np.int32)
-    launch_rows(write_order, n, order)
-    for keys, n_bits in ((depth_bits, 8 * depth_bits.dtype.itemsize), (tiles, (n_tiles - 1).bit_length())):
-        for shift in range(0, n_bits, DIGIT_BITS):
-            launch_rows(count_digits, n_chunks, keys, order, np.int32(shift), counts)
-            launch_rows(move_pairs, n_chunks, keys, order, np.int32(shift), exclusive_sums(counts), moved)
-            order, moved = moved, order
-    return order
+        return keys, values
+    other_keys, other_values = empty(n, keys.dtype), empty(n, np.int32)
+    totals = empty(N_DIGITS * n_blocks, np.int32)
+    for shift in map(np.int32, range(0, n_bits, DIGIT_BITS)):
+        launch(count_digits, n_blocks, THREADS, keys, shift, totals)
+        starts = exclusive_sums(totals)
+        launch(move_keys, n_blocks, THREADS, keys, values, shift, starts, other_keys, other_values)
+        keys, values, other_keys, other_values = other_keys, other_values, keys, values
+    return keys, values

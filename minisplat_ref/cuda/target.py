@@ -17,7 +17,7 @@ from minisplat_ref.jit import lanes
 
 try:
     import numba.cuda
-    import numba_cuda  # noqa: F401  # Numba's own module of that name is older
+    import numba_cuda  # Numba's own module of that name is older
 except ImportError as error:
     raise InputError("backend cuda needs the package numba-cuda; pip install 'minisplat_ref[cuda]'") from error
 
@@ -74,6 +74,12 @@ def check_device() -> None:
     try:
         launch(GpuKernel(_do_nothing), 1, 1, np.float32(0))
         cuda.synchronize()
+    except (AttributeError, ImportError) as error:  # before the driver is asked
+        versions = f"numba-cuda {numba_cuda.__version__} does not work with NumPy {np.__version__}"
+        raise InputError(
+            f"{versions} ({one_line(str(error))[:200]}): pip install 'minisplat_ref[cuda]' takes releases that do, or"
+            " use --backend cpu"
+        ) from error
     except Exception as error:  # a driver that does not know the compiler's PTX fails here, in one of several ways
         why = one_line(str(error))[:200]
         raise InputError(

@@ -6,6 +6,8 @@ come after them, so that the first that differs is where to look: a wrong conic 
 everything else wrong.
 """
 
+import functools
+import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +23,7 @@ from minisplat_ref.oracle.tolerances import EXACT, StageTolerance
 from minisplat_ref.types import Floats
 
 Arrays = dict[str, np.ndarray]
+POSE = "viewmats"
 
 
 class CallScene(NamedTuple):
@@ -81,6 +84,8 @@ class Call(NamedTuple):
     """The correct steps."""
     peer: Callable[[], Callable[..., Any]] | None = None
     """Returns the call by gsplat's own torch functions."""
+    profiles: Mapping[str, Callable[[Any], Any]] = {}
+    """Rules of other versions by name: each turns the steps into those of the version."""
 
 
 class CallRenderer(NamedTuple):
@@ -91,9 +96,20 @@ class CallRenderer(NamedTuple):
     arrays: Callable[[CallScene], Arrays]
 
 
-def truth(call: Call, scene: CallScene) -> Arrays:
-    """Return all arrays of a scene, by the reference."""
-    return _ours(call, scene, {"backend": "reference"})
+def truth(call: Call, scene: CallScene, profile: str | None = None) -> Arrays:
+    """Return all arrays of a scene, by the reference.
+
+    Raises
+    ------
+    InputError
+        The call has no rules of that name.
+    """
+    if profile is None:
+        return _ours(call, scene, {"backend": "reference"})
+    if profile not in call.profiles:
+        known = f"give {' or '.join(call.profiles)}, or leave it out" if call.profiles else "leave it out"
+        raise InputError(f"--profile {profile}: {call.name} has no such rules; {known}")
+    return _ours(call, scene, {"backend": "reference", "steps": call.profiles[profile](call.steps)})
 
 
 def planted_steps(call: Call, name: str) -> Any:
@@ -210,6 +226,8 @@ def _ratio(case: Case) -> float:
 
 
 def _case(name: str, about: StageArray, scene: str, got: np.ndarray, known: np.ndarray, dtype: str) -> Case:
+    if (1, *np.shape(got)) == np.shape(known):  # gsplat 1.5.3 squeezes surf_normals where there is one camera
+        got = np.asarray(got)[None]
     if np.shape(got) != np.shape(known):
         raise InputError(f"{name} has shape {list(np.shape(got))} in scene {scene}; it must be {list(np.shape(known))}")
     got, known = about.part(np.asarray(got)), about.part(known)
@@ -248,7 +266,7 @@ def _read(call: Call, folder: Path, scene: CallScene) -> Arrays:
 
 def _function(call: Call, name: str, dtype: str, arrays: str | None) -> CallRenderer:
     function, vjp = load_function(name)
-    kind = arrays or kind_of(function)
+    kind, function = arrays or kind_of(function), _unpacked(function)
     if kind == "torch":
         return CallRenderer(f"{name} {dtype}", dtype, lambda scene: _by_torch(call, function, scene, dtype))
     if kind != "numpy":
@@ -265,6 +283,15 @@ def _function(call: Call, name: str, dtype: str, arrays: str | None) -> CallRend
         return arrays
 
     return CallRenderer(f"{name} {dtype}", dtype, run)
+
+
+def _unpacked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Switch off gsplat's packed projection, in which the meta has other rows and no camera is distorted."""
+    try:
+        has_it = "packed" in inspect.signature(function).parameters
+    except (TypeError, ValueError):  # compiled code may not tell
+        has_it = False
+    return functools.partial(function, packed=False) if has_it else function
 
 
 def _named(call: Call, results: Any) -> Arrays:
@@ -288,6 +315,15 @@ def _numpy(value: Any) -> Floats:
 
 
 def _by_torch(call: Call, function: Callable[..., Any], scene: CallScene, dtype: str) -> Arrays:
+    try:
+        return _differentiated(call, function, scene, dtype, call.leaves)
+    except NotImplementedError:  # by gsplat 1.5.3 with_eval3d where the pose is differentiated
+        return _differentiated(call, function, scene, dtype, tuple(name for name in call.leaves if name != POSE))
+
+
+def _differentiated(
+    call: Call, function: Callable[..., Any], scene: CallScene, dtype: str, leaves: tuple[str, ...]
+) -> Arrays:
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -295,7 +331,7 @@ def _by_torch(call: Call, function: Callable[..., Any], scene: CallScene, dtype:
         name: torch.tensor(value, device=device) if isinstance(value, np.ndarray) else value
         for name, value in _cast(scene.arguments, dtype).items()
     }
-    for name in call.leaves:
+    for name in leaves:
         arguments[name].requires_grad_()
     results = function(**arguments)
     arrays = _named(call, results)
@@ -304,5 +340,5 @@ def _by_torch(call: Call, function: Callable[..., Any], scene: CallScene, dtype:
         for name, image in zip(call.images, results, strict=False)
         if image is not None and image.requires_grad
     ]
-    found = torch.autograd.grad(sum(terms), [arguments[name] for name in call.leaves], allow_unused=True)
-    return arrays | {f"v_{name}": _numpy(v) for name, v in zip(call.leaves, found, strict=True) if v is not None}
+    found = torch.autograd.grad(sum(terms), [arguments[name] for name in leaves], allow_unused=True)
+    return arrays | {f"v_{name}": _numpy(v) for name, v in zip(leaves, found, strict=True) if v is not None}

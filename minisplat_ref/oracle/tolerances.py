@@ -59,6 +59,7 @@ class StageTolerance(NamedTuple):
 EXACT = StageTolerance(0.0, 0.0, "given or counted, not computed; a difference may still be harmless")
 # A few roundings of 6e-8 ...
 POSITION = StageTolerance(COMPARE_FLOAT64, 2e-6, "a product with the view matrix and one division")
+UNSCENTED = StageTolerance(COMPARE_FLOAT64, 5e-5, "weights of -99 and 16.7, whose sizes add up to 199, times 6e-8")
 # ... divided by the determinant of a covariance whose condition number is up to 1e2 ...
 SHAPE = StageTolerance(
     COMPARE_FLOAT64, 2e-5, "the 2x2 inverse multiplies rounding by the condition number of the covariance"

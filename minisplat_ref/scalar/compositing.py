@@ -13,6 +13,7 @@ from minisplat_ref.jit.lanes import maximum, minimum, select
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 
 PIVOT_MIN = np.float32(1e-14)  # smallest pivot of a conic relative to c: a little above float64's rounding
+HALF_FACTOR_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner than float32 can square
 
 
 class Frame(NamedTuple):
@@ -40,6 +41,12 @@ def factors(a, b, c):
     """
     slope = b / a
     return a, slope, maximum(c - b * slope, PIVOT_MIN * c)
+
+
+@scalar
+def half_of(factor):
+    """Return half of a factor of a conic; a negative one becomes so large that it leaves no hits."""
+    return select(factor >= ZERO, minimum(HALF * factor, HALF_FACTOR_MAX), HALF_FACTOR_MAX)
 
 
 @scalar

@@ -106,6 +106,13 @@ def test_a_driver_that_is_too_old_is_told_in_one_line():
     assert "the GPU Old Card cannot run a kernel ([222] unsupported toolchain): update its driver" in said
 
 
+def test_a_numpy_that_numba_cuda_does_not_know_is_told_from_a_driver():
+    fails = "lambda function: (_ for _ in ()).throw(AttributeError('no attribute row_stack'))"
+    said = say("target.check_device()", jit=fails)
+    assert f"does not work with NumPy {np.__version__} (no attribute row_stack): pip install" in said
+    assert "driver" not in said
+
+
 def test_too_little_memory_is_foreseen():
     assert say("target.check_room(3e9, '60,000,000 pairs (tile, Gaussian)')").endswith(
         "the GPU has no memory for 60,000,000 pairs (tile, Gaussian): 3.00 GB are needed, 0.00 GB are free; use smaller"

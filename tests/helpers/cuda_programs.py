@@ -77,8 +77,8 @@ def record_launches():
         p = p._replace(conics=p.conics.astype(np.float64))
         grid = TileGrid(camera.width, camera.height, tiling.TILE, tiling.TILE)
         tiling.bin_gaussians(p, grid, GSPLAT_MAIN)
-        pairs = np.zeros(100, np.int32)
-        sorting.sort_pairs(pairs, pairs, 4)
+        pairs = np.zeros(5_000_000, np.int32)  # whose counts are scanned by several blocks
+        sorting.sort_by_key(pairs, pairs.copy(), 4)
         bins = REFERENCE.bin_gaussians(p, grid, GSPLAT_MAIN)
         harmonics = g.means, g.sh_dc, g.sh_rest, camera, 3, p.radii
         colors = spherical_harmonics.sh_colors(*harmonics)

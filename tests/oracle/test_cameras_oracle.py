@@ -9,7 +9,10 @@ from minisplat_ref.cli import main
 from minisplat_ref.mechanisms.cameras.oracle.call import CALL, STAGES
 from minisplat_ref.mechanisms.cameras.oracle.hard_cases import CASES, run_cases, select
 from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED
+from minisplat_ref.mechanisms.cameras.oracle.profiles import has_all_points
+from minisplat_ref.oracle import call_comparison
 from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
+from minisplat_ref.types import Camera, Primitives
 
 OF_CAMERAS = ["--call", "rasterization_cameras"]
 
@@ -55,6 +58,70 @@ def test_a_wrong_answer_is_found():
     assert run_cases((wrong,)).n_failed == 3
 
 
+def test_gsplat_1_5_drops_a_gaussian_with_a_sigma_point_outside_of_the_margin():
+    """By hand: a camera of 100 x 80 px and focal length 100; the points are at +-sqrt(0.03) = 0.173 deviations."""
+    camera = Camera(np.eye(3), np.zeros(3), 100.0, 100.0, 50.0, 40.0, 100, 80)
+    means = [  # scales are 0.1, so points lie at 0.0173 from the mean: those nearer to the camera by 1.8 % further out
+        (0.55, 0.0, 1.0),  # x = 105 px, and its points within 106.8: inside of the margin, which ends at 110
+        (0.59, 0.0, 1.0),  # x = 109, and one of its points at 110.7
+        (-0.59, 0.0, 1.0),  # x = -9, and one of its points at -10.7
+        (0.0, 0.45, 1.0),  # y = 85, within 86.7: the margin ends at 88
+        (0.0, 0.475, 1.0),  # y = 87.5, and one of its points at 89.2
+        (0.0, 0.0, -1.0),  # behind
+    ]
+    n = len(means)
+    quats = np.tile([1.0, 0, 0, 0], (n, 1))
+    primitives = Primitives(np.array(means), quats, np.full((n, 3), 0.1), np.full(n, 0.5))
+    assert has_all_points(primitives, camera).tolist() == [True, False, False, True, False, False]
+
+
+def test_the_rules_of_gsplat_1_5_are_told_from_ours(known):
+    """Its fisheye sees nothing behind the camera's plane and orders by z, and it draws whole tiles."""
+    scene, ours = known["fisheye"]
+    theirs = truth(CALL, scene, "GSPLAT_1_5")
+    view = scene.arguments["viewmats"][0]
+    z = scene.arguments["means"] @ view[2, :3] + view[2, 3]
+    is_shown = theirs["radii"][0, :, 0] > 0
+    assert is_shown.any() and not is_shown[z < 0].any() and (ours["radii"][0, z < 0, 0] > 0).any()
+    np.testing.assert_allclose(theirs["depths"][0][is_shown], z[is_shown], rtol=1e-12)
+    renderer = choose_renderer(CALL, "cpu", "float64")
+    assert compare(CALL, renderer, {"fisheye": (scene, theirs)}).settings["first_difference"] == "projection: depths"
+    scene, ours = known["brown"]  # a pinhole: the same order, and more pixels
+    theirs = truth(CALL, scene, "GSPLAT_1_5")
+    is_same = (theirs["radii"] > 0) == (ours["radii"] > 0)
+    assert is_same.mean() > 0.95 and np.abs(theirs["render_alphas"] - ours["render_alphas"]).max() > 0.01
+
+
+def test_what_gsplat_cannot_differentiate_is_left_out_and_packing_is_switched_off(known, monkeypatch):
+    """gsplat 1.5.3 raises NotImplementedError for the gradient of the pose, and takes no packed projection."""
+    torch = pytest.importorskip("torch", reason="the extra minisplat_ref[peers] is not installed")
+    scene, arrays = known["brown"]
+
+    class Blended(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, means, viewmats):
+            ctx.needs_pose = viewmats.requires_grad
+            return torch.tensor(arrays["render_colors"]) + 0 * means.sum()
+
+        @staticmethod
+        def backward(ctx, v):
+            if ctx.needs_pose:
+                raise NotImplementedError
+            return torch.tensor(arrays["v_means"]).to(v), None
+
+    def rasterization(means, viewmats, packed=True, **_):
+        assert packed is False
+        return Blended.apply(means, viewmats), torch.tensor(arrays["render_alphas"])
+
+    monkeypatch.setattr(call_comparison, "load_function", lambda name: (rasterization, None))
+    renderer = choose_renderer(CALL, "module:function", "float64", "torch")
+    report = compare(CALL, renderer, {"brown": (scene, arrays)})
+    assert report.n_failed == 0 and "v_viewmats" in report.settings["not_given"]
+    assert [case.name for case in report.cases] == [
+        *("alpha: render_alphas", "colours: render_colors", "gradients: v_means"),
+    ]
+
+
 def test_golden_vectors_and_a_renderer_of_ones_own(tmp_path, capsys, monkeypatch):
     """Export, compare the folder with itself, and a function that gets gsplat's keywords, by the command line."""
     golden = tmp_path / "golden"
@@ -90,6 +157,10 @@ def test_golden_vectors_and_a_renderer_of_ones_own(tmp_path, capsys, monkeypatch
         (["compare", "cpu", "--scene", "sh3"], "choose all or one of brown, fisheye, hard, ortho"),
         (["compare", "planted:nothing"], "error 'nothing' is unknown"),
         (["compare", "gsplat-torch"], "nor a renderer of other cameras: package.module:function, cpu, cpu-exact,"),
+        (
+            ["compare", "cpu", "--profile", "INRIA"],
+            "no such rules; give GSPLAT_1_5, or leave it out",
+        ),
         (["hard-cases", "--only", "needle"], "no hard case holds 'needle'"),
     ],
 )

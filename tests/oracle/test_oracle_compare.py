@@ -26,10 +26,11 @@ from minisplat_ref.oracle.comparison.staged import STAGES, as_report, compare_sc
 from minisplat_ref.oracle.golden import running as golden_running
 from minisplat_ref.oracle.golden.files import export
 from minisplat_ref.oracle.golden.format import SPECS
-from minisplat_ref.oracle.golden.running import run_stages
+from minisplat_ref.oracle.golden.running import reference_bins, run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.planted import PLANTED
 from minisplat_ref.training.adam import AdamRule
+from minisplat_ref.types import Projection
 from tolerances import PARITY_FLOAT64
 
 SCENES = {recipe.name: recipe for recipe in RECIPES}
@@ -566,3 +567,21 @@ def test_the_command_names_the_stage_and_writes_json(tmp_path, capsys):
     assert "all 32 cases passed" in capsys.readouterr().out
     assert main(["oracle", "compare", "nothing"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_transmittance_read_from_alpha_in_float32_is_as_far_off_as_gsplats_gradients():
+    """1 - alpha is off by 3e-8, so T = 1e-4, where blending stops, by 3e-4: 2.3e-4 of the largest gradient of colours."""
+    scenes, _ = choose_scenes(choose_renderer("cpu", "float32"), "odd-size", "reference", None)
+    scene = scenes["odd-size"]
+    a = scene.arrays
+    given = Projection(*(a[name] for name in ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")))
+    blended = given, a["colors"], a["background"], reference_bins(a, scene.conventions, (16, 16)), scene.conventions
+    output = REFERENCE.composite(*blended)
+    T = 1 - a["alpha"]
+    factor = (1 - a["alpha"].astype(np.float32)).astype(np.float64) / T  # of every weight in the pixel
+    correct, off = (
+        REFERENCE.composite_vjp(*blended, output, v, a["v_alpha"]).colors
+        for v in (a["v_image"], factor[..., None] * a["v_image"])
+    )
+    assert T.min() < 1.1e-4 and np.abs(factor - 1).max() == pytest.approx(2.9e-4, abs=1e-5)
+    assert np.abs(off - correct).max() / np.abs(correct).max() == pytest.approx(2.3e-4, abs=1e-5)

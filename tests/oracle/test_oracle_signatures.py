@@ -9,7 +9,9 @@ from data_tools import signatures as measuring
 from minisplat_ref import gsplat_compat
 from minisplat_ref.cli import main
 from minisplat_ref.oracle.comparison import signatures
+from minisplat_ref.oracle.comparison.measures import Difference
 from minisplat_ref.oracle.comparison.signatures import Mark, Trace, distance, likeliest, mark, signature
+from minisplat_ref.oracle.comparison.staged import Row, slight
 from minisplat_ref.oracle.faults import FAULTS
 from minisplat_ref.oracle.faults.backward import scale_gradient
 from minisplat_ref.oracle.faults.forward import with_conics
@@ -233,3 +235,18 @@ def test_what_no_fault_makes_wrong_looks_like_none():
     found = {"loss": Trace(frozenset(["sh3"]), 0.0, 1.0), "adam_values_after": Trace(frozenset(["sh3"]))}
     assert likeliest(found, ["sh3"], is_fed=True) == []
     assert likeliest({"image": Trace(frozenset(["mine"]))}, ["mine"], is_fed=True) == []
+
+
+def test_a_few_values_little_above_the_limit_are_called_a_loss_of_precision():
+    """gsplat begins its gradient with T = 1 - alpha in float32, which is off by up to 3e-4 where T is 1e-4."""
+
+    def rows(excess, n_over):
+        off = Difference(excess * 2e-4, 1e-5, 2.0, 1e-4, n_over, 1000)
+        return [Row("sh3", "v_colors", "diverges", off, arrays=("v_colors",)), Row("sh3", "image", "agrees", None)]
+
+    assert slight(rows(4.9, 10)) == [
+        "10 of 1,000 values are off, by up to 4.9 times what is allowed: a loss of precision rather than a wrong"
+        " formula, which is wrong in most values"
+    ]
+    assert slight(rows(5.1, 10)) == slight(rows(4.9, 11)) == slight(rows(4.9, 10)[1:]) == []
+    assert slight([*rows(4.9, 10), Row("sh3", "radii", "diverges", None)]) == []

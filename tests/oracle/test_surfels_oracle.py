@@ -15,7 +15,7 @@ from minisplat_ref.mechanisms.surfels.oracle.call import CALL, STAGES
 from minisplat_ref.mechanisms.surfels.oracle.hard_cases import CASES, run_cases, select
 from minisplat_ref.mechanisms.surfels.oracle.planted import PLANTED
 from minisplat_ref.mechanisms.surfels.oracle.scenes import scenes
-from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
+from minisplat_ref.oracle.call_comparison import CallRenderer, choose_renderer, compare, truth
 from tolerances import GRADIENT_STEP_IMAGE
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("torch", "gsplat"))
@@ -163,13 +163,27 @@ def test_golden_vectors_and_a_renderer_of_ones_own(tmp_path, capsys, monkeypatch
     assert "all 6 cases passed" in out and "not given: radii, means2d" in out
 
 
+def test_normals_without_the_cameras_axis_are_those_of_one_camera(known):
+    """gsplat 1.5.3 squeezes surf_normals, whatever its docstring says; another shape is refused all the same."""
+    call, (scene, arrays) = CALL, known["median"]
+    squeezed = {"surf_normals": arrays["surf_normals"][0]}
+    (case,) = compare(call, CallRenderer("other", "float64", lambda _: squeezed), {"median": (scene, arrays)}).cases
+    assert case.passed and arrays["surf_normals"].shape[0] == 1 and np.ptp(arrays["surf_normals"]) > 0.1
+    squeezed["surf_normals"] = arrays["surf_normals"][0, 0]
+    with pytest.raises(InputError, match="surf_normals has shape"):
+        compare(call, CallRenderer("other", "float64", lambda _: squeezed), {"median": (scene, arrays)})
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["compare", "cpu", "--scene", "sh3"], "scene 'sh3' is unknown; choose all or one of ordinary, median, hard"),
         (["compare", "planted:nothing"], "error 'nothing' is unknown"),
         (["compare", "inria"], "'inria' is neither a folder of arrays nor a renderer of surfels"),
-        (["compare", "cpu", "--profile", "INRIA"], "leave the option out"),
+        (
+            ["compare", "cpu", "--profile", "INRIA"],
+            "rasterization_2dgs has no such rules; leave it out",
+        ),
         (["hard-cases", "--only", "needle"], "no hard case holds 'needle'"),
     ],
 )

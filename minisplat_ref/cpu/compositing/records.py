@@ -12,9 +12,8 @@ from minisplat_ref.cpu.gaussian_rows import list_visible, load_rows, round_lanes
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, cast, gather, minimum, scatter, select
-from minisplat_ref.jit.literals import HALF, ZERO
-from minisplat_ref.scalar.compositing import factors
+from minisplat_ref.jit.lanes import WIDTH, cast, gather, minimum, scatter
+from minisplat_ref.scalar.compositing import HALF_FACTOR_MAX, factors, half_of
 from minisplat_ref.scalar.tiling import Outline, visible_outline
 from minisplat_ref.types import Floats, Projection
 
@@ -22,18 +21,11 @@ from minisplat_ref.types import Floats, Projection
 MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY = range(6)
 TURNED_SLOPE, TURNED_INVERSE_A, TURNED_PIVOT, Q, TURNED_TILT, COLUMN_FIRST, COLUMN_END, COLOR = range(6, 14)
 N_FUSED = 3  # channels that every record has; fewer are padded with zeros
-HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner than float32 can square
 
 
 def record_size(n_channels: int) -> int:
     """Return the size of a record."""
     return COLOR + max(n_channels, N_FUSED)
-
-
-@scalar
-def _half(factor):
-    """Return half of a factor of a conic; a negative one becomes so large that it leaves no hits."""
-    return select(factor >= ZERO, minimum(HALF * factor, HALF_A_MAX), HALF_A_MAX)
 
 
 @scalar
@@ -47,11 +39,11 @@ def _write_eight(rows, projection, colors, alpha_min, records):
     means2d, boxes = projection.means2d, projection.boxes
     first_half = (
         *(gather(means2d, rows, 0), gather(means2d, rows, 1)),
-        *round_lanes((_half(a_factor), slope, _half(pivot)), zero),
+        *round_lanes((half_of(a_factor), slope, half_of(pivot)), zero),
         *(opacity, outline.slope, outline.inverse_a),
     )
     second_half = (
-        *(minimum(outline.pivot, HALF_A_MAX), outline.q, outline.tilt),
+        *(minimum(outline.pivot, HALF_FACTOR_MAX), outline.q, outline.tilt),
         *(cast(gather(boxes, rows, 0), zero), cast(gather(boxes, rows, 2), zero)),
         *(gather(colors, rows, 0), gather(colors, rows, 1), gather(colors, rows, 2)),
     )

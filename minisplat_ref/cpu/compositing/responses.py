@@ -20,7 +20,7 @@ from minisplat_ref.constants import LIST_ORDER
 from minisplat_ref.cpu.compositing.pixel_rows import hit_ray_row, hit_row
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.literals import TWO
-from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors, mahalanobis
+from minisplat_ref.scalar.compositing import HALF_FACTOR_MAX, conic_vjp_of_moments, factors, mahalanobis
 from minisplat_ref.types import Floats, Ints, Projection
 
 
@@ -85,7 +85,6 @@ class KernelResponse(NamedTuple):
 # Columns of a conic's record; the depth has no derivative.
 MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY, DEPTH = range(7)
 CONIC_GRADIENTS = DEPTH  # records that extend a conic's begin with these columns
-HALF_A_MAX = 1e30  # without a low-pass a footprint can be thinner than float32 can square
 
 
 @functools.cache
@@ -124,8 +123,8 @@ def _conic_records(projection: Projection, dtype: np.dtype) -> Floats:
     records = np.empty((len(a), DEPTH + 1), dtype)
     records[:, MEAN_X], records[:, MEAN_Y] = projection.means2d.T
     # Rounding can make a factor negative: then only the pixel at the centre is hit.
-    records[:, HALF_A] = np.where(a >= 0, np.minimum(a / 2, HALF_A_MAX), HALF_A_MAX)
-    records[:, HALF_PIVOT] = np.where(pivot >= 0, np.minimum(pivot / 2, HALF_A_MAX), HALF_A_MAX)
+    records[:, HALF_A] = np.where(a >= 0, np.minimum(a / 2, HALF_FACTOR_MAX), HALF_FACTOR_MAX)
+    records[:, HALF_PIVOT] = np.where(pivot >= 0, np.minimum(pivot / 2, HALF_FACTOR_MAX), HALF_FACTOR_MAX)
     records[:, SLOPE], records[:, OPACITY], records[:, DEPTH] = slope, projection.opacities, projection.depths
     return records
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from minisplat_ref.mechanisms.cameras.gsplat_call import GRADIENTS, STEPS, rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED
+from minisplat_ref.mechanisms.cameras.oracle.profiles import PROFILES
 from minisplat_ref.mechanisms.cameras.oracle.scenes import LEAVES, scenes
 from minisplat_ref.oracle.call_comparison import Arrays, Call, StageArray
-from minisplat_ref.oracle.tolerances import EXACT, GRADIENT, IMAGE, POSITION
+from minisplat_ref.oracle.tolerances import EXACT, GRADIENT, IMAGE, POSITION, UNSCENTED
 from minisplat_ref.types import Floats
 
 NAMES = ("render_colors", "render_alphas")
@@ -21,7 +22,7 @@ _SHAPE = "in the shape of the argument"
 STAGES: Mapping[str, StageArray] = {
     "means2d": StageArray(
         "projection",
-        POSITION,
+        UNSCENTED,
         "[1, N, 2] px: means of the unscented transform, 0 where a sigma point is not seen; of ortho A mu + b",
         is_of_rows=True,
     ),
@@ -58,4 +59,5 @@ CALL = Call(
     differentiate=_differentiate,
     planted=PLANTED,
     steps=STEPS,
+    profiles=PROFILES,
 )

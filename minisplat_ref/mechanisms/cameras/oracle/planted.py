@@ -1,15 +1,13 @@
 """Errors planted in ``rasterization`` with other cameras, each at one step, to see where a comparison finds it."""
 
-import inspect
 from collections.abc import Callable, Mapping
-from types import FunctionType
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.mechanisms.cameras import ray_footprints
 from minisplat_ref.mechanisms.cameras.gsplat_call import Steps
 from minisplat_ref.mechanisms.cameras.models import CameraModel, model_of, ray_table, z_depths, z_depths_vjp
+from minisplat_ref.mechanisms.cameras.oracle.profiles import exchange, in_front
 from minisplat_ref.mechanisms.cameras.ray_footprints import FootprintGradient, LensFootprints
 from minisplat_ref.oracle.call_comparison import PlantedInCall
 from minisplat_ref.types import Camera, Floats, Primitives
@@ -29,18 +27,6 @@ def _bent(change: Bend) -> Callable[[Steps], Steps]:
     return plant
 
 
-def _projected(**functions: Any) -> Callable[[Steps], Steps]:
-    """Return what exchanges functions that the projection and its gradient call."""
-
-    def plant(steps: Steps) -> Steps:
-        names = {**vars(ray_footprints), **functions}
-        correct = inspect.unwrap(ray_footprints.project), ray_footprints.project_vjp
-        project, project_vjp = (FunctionType(step.__code__, names) for step in correct)
-        return steps._replace(project=project, project_vjp=project_vjp)
-
-    return plant
-
-
 def _opencv_order(k: list[float], p: list[float]) -> tuple[list[float], list[float]]:
     """Read (k1, k2, p1, p2, k3, ...) as if it were (k1, k2, k3, ...)."""
     return [*k[:2], *p, *k[2:4]], k[4:]
@@ -50,12 +36,6 @@ def _unfolded(camera: Camera) -> CameraModel:
     model = model_of(camera)
     is_brown = camera.optics is not None and camera.optics.model == "brown"
     return model._replace(is_seen=lambda x, camera: x[:, 2] > 0) if is_brown else model
-
-
-def _behind(camera: Camera) -> CameraModel:
-    """See what is in front of the camera alone, through a fisheye too."""
-    model = model_of(camera)
-    return model._replace(is_seen=lambda x, camera: (x[:, 2] > 0) & model.is_seen(x, camera))
 
 
 def _by_z(camera: Camera) -> CameraModel:
@@ -111,11 +91,11 @@ PLANTED: Mapping[str, PlantedInCall] = {
     "swapped-tangential": PlantedInCall("p1 for p2, and p2 for p1", "projection", _bent(lambda k, p: (k, p[::-1]))),
     "opencv-order": PlantedInCall("tangential coefficients read as k3 and k4", "projection", _bent(_opencv_order)),
     "no-denominator": PlantedInCall("k4 to k6 left out", "projection", _bent(lambda k, p: ([*k[:3], 0, 0, 0], p))),
-    "fold-not-culled": PlantedInCall("beyond the fold of a lens seen", "culling", _projected(model_of=_unfolded)),
-    "half-space": PlantedInCall("beyond 90 degrees culled", "culling", _projected(model_of=_behind)),
-    "z-for-distance": PlantedInCall("a fisheye ordered by the centres' z", "projection", _projected(model_of=_by_z)),
-    "corner-rays": PlantedInCall("rays through the corners of pixels", "alpha", _projected(ray_table=_corner_rays)),
-    "straight-rays": PlantedInCall("rays not bent by the lens", "alpha", _projected(ray_table=_bare_rays)),
+    "fold-not-culled": PlantedInCall("beyond the fold of a lens seen", "culling", exchange(model_of=_unfolded)),
+    "half-space": PlantedInCall("beyond 90 degrees culled", "culling", exchange(model_of=in_front)),
+    "z-for-distance": PlantedInCall("a fisheye ordered by the centres' z", "projection", exchange(model_of=_by_z)),
+    "corner-rays": PlantedInCall("rays through the corners of pixels", "alpha", exchange(ray_table=_corner_rays)),
+    "straight-rays": PlantedInCall("rays not bent by the lens", "alpha", exchange(ray_table=_bare_rays)),
     "one-sigma": PlantedInCall("bounds of one standard deviation", "alpha", _one_sigma),
     "frozen-shape": PlantedInCall("no gradient via the whitening", "gradients", _without("whitenings")),
     "frozen-position": PlantedInCall("no gradient via the position", "gradients", _without("positions")),
