@@ -570,7 +570,7 @@ def test_the_command_names_the_stage_and_writes_json(tmp_path, capsys):
 
 
 def test_a_transmittance_read_from_alpha_in_float32_is_as_far_off_as_gsplats_gradients():
-    """1 - alpha is off by 3e-8, so T = 1e-4, where blending stops, by 3e-4: 2.3e-4 of the largest gradient of colours."""
+    """1 - alpha is off by 3e-8, and T = 1e-4, where blending stops, by 3e-4: 2.3e-4 of the largest gradient."""
     scenes, _ = choose_scenes(choose_renderer("cpu", "float32"), "odd-size", "reference", None)
     scene = scenes["odd-size"]
     a = scene.arrays
