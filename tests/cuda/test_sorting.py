@@ -1,0 +1,40 @@
+"""The scan and the sort of the backend cuda beside NumPy's, in Numba's simulator, with blocks of a few numbers."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuda_sorting import SCANNED, SORTED, make_counts, make_keys
+
+pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
+
+HELPERS = Path(__file__).parent.parent / "helpers"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sorting") / "results.pickle"
+    places = os.pathsep.join([str(HELPERS), str(HELPERS.parent.parent), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
+    subprocess.run([sys.executable, HELPERS / "cuda_sorting.py", path], env=environment, check=True)
+    return pickle.loads(path.read_bytes())
+
+
+@pytest.mark.parametrize("n", SCANNED)
+def test_sums_before_each_number(n, simulated):
+    assert simulated[0][n].tolist() == [0, *np.cumsum(make_counts(n))]
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+@pytest.mark.parametrize("n", SORTED)
+def test_equal_keys_keep_their_order(dtype, n, simulated):
+    keys, (found_keys, found_order) = make_keys(n, dtype), simulated[1][dtype.__name__, n]
+    order = np.argsort(keys, kind="stable")
+    np.testing.assert_array_equal(found_keys, keys[order])
+    np.testing.assert_array_equal(found_order, order)
+    assert (found_keys.dtype, found_order.dtype) == (dtype, np.int32)
