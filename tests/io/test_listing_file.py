@@ -8,10 +8,11 @@ import pytest
 
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.io import list_scene, load_scene
 from minisplat_ref.io.lens import Lens
 from minisplat_ref.io.listing_file import ARRAYS, from_files, select, to_arrays, to_json
-from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene
+from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing
 from scenes import make_camera
 
 SETTINGS = {"n_views": 6, "width": 16, "height": 12, "n_points": 30, "test_every": 4}
@@ -101,3 +102,9 @@ def test_files_lens_and_time_come_back(tmp_path):
     moved = tmp_path / "moved"
     moved.mkdir()
     assert from_files(moved, content, to_arrays(listing)).train_photos[0].path == moved / "images" / "b.png"
+
+
+def test_a_scene_without_photographs_has_no_views(tmp_path):
+    listing = make_listing(tmp_path, [], [], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), alpha_is_mask=True)
+    with pytest.raises(InputError, match="0 training and 0 test view"):
+        build_scene(listing, build_reading(1, None, False, True))
