@@ -4,17 +4,24 @@ A planted error is a changed line of one function (:mod:`data_tools.survey_error
 Python it is planted in the running program, and the commands are called; kernels that contain it are recompiled, in
 a copy of the package, by separate processes, which takes minutes. A command notices an error if its exit code is
 not 0, or if it ends in an exception.
+
+All of it takes hours. ``--out DIR`` keeps what has been found, so that the same command continues; ``--workers N`` and
+``--cluster ADDRESS`` hand errors out, one a process, and the table is the same. Workers of a scheduler see this
+repository under the same path.
 """
 
+import hashlib
 import inspect
 import os
 import shutil
 import subprocess
 import sys
 import textwrap
+from argparse import SUPPRESS
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from fnmatch import fnmatch
+from functools import partial
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
@@ -26,9 +33,13 @@ import numpy as np
 
 import minisplat_ref
 from data_tools.survey_errors import ERRORS, PlantedLine
-from minisplat_ref.arguments import HelpFormatter, Parser
+from minisplat_ref.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
+from minisplat_ref.cli.study import hand_out
 from minisplat_ref.errors import InputError
 from minisplat_ref.reporting import markdown_table
+from minisplat_ref.runs.cluster import Workers
+from minisplat_ref.runs.worker import versions
+from minisplat_ref.studies.records import handing_out, one_job, resume
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 COMMANDS = {
@@ -140,8 +151,31 @@ def as_markdown(outcomes: Sequence[Outcome]) -> str:
     return markdown_table(["planted error", "where", *headings], rows)
 
 
-def main() -> None:
-    """Survey what the command line says; exit with code 1 if an error passes every command."""
+def survey_all(errors: Sequence[PlantedLine], commands: Sequence[str], folder: Path) -> list[Outcome]:
+    """Survey the errors of which a folder has no record yet, here or by workers; return all, in their order.
+
+    Raises
+    ------
+    InputError
+        The folder has records of other commands or of another source.
+    """
+    by_name = {error.what: error for error in errors}
+
+    def measure(what: str) -> list[dict[str, dict[str, bool]]]:
+        notices = survey(by_name[what], commands).notices
+        noticed = ", ".join(heading for heading, is_noticed in notices.items() if is_noticed)
+        print(f"{what}: {noticed or 'PASSES EVERY COMMAND'}", file=sys.stderr, flush=True)
+        return [{"notices": notices}]
+
+    lines = hashlib.sha256(repr(ERRORS).encode()).hexdigest()[:8]
+    settings = {"commands": list(commands), "errors": lines, **versions()}
+    records = resume(folder, settings, [{"what": what} for what in by_name], measure, nouns="errors")
+    found = {record["what"]: record["notices"] for record in records}
+    return [Outcome(error, found[error.what]) for error in errors]
+
+
+def main(words: Sequence[str]) -> int:
+    """Survey what the command line says; return 1 if an error passes every command."""
     parser = Parser(
         prog="python -m data_tools.survey",
         description="Plant errors one at a time, run the oracle's commands, and print which of them notice which.",
@@ -158,19 +192,32 @@ def main() -> None:
         metavar="NAME",
         help=f"{', '.join(COMMANDS)} (default all)",
     )
-    args = parser.parse_args()
+    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for what is found, or one to continue")
+    add_worker_arguments(parser, "survey N errors at once (default 0: in turn)", "by the workers of a Dask scheduler")
+    parser.add_argument("--job", type=integer(0), help=SUPPRESS)  # what a worker is told
+    args = parser.parse_args(words)
     errors = [error for error in ERRORS if fnmatch(error.what, f"*{args.only}*")]
     if not errors:
         parser.error(f"no error's words hold {args.only!r}")
-    outcomes = []
-    for error in errors:
-        outcome = survey(error, args.commands)
-        noticed = ", ".join(heading for heading, notices in outcome.notices.items() if notices)
-        print(f"{error.what}: {noticed or 'PASSES EVERY COMMAND'}", file=sys.stderr, flush=True)
-        outcomes.append(outcome)
+    workers = Workers(args.workers, args.cluster)
+    if workers.is_used and args.out is None:
+        parser.error("workers leave what they find in a folder: give --out DIR")
+    with ExitStack() as stack:
+        folder = args.out or Path(stack.enter_context(TemporaryDirectory())) / "survey"
+        if args.job is not None:
+            with one_job(args.job):
+                survey_all(errors, args.commands, folder)
+            return 0
+        elsewhere = partial(hand_out, workers, without_workers(words), noun="survey", program="data_tools.survey")
+        with handing_out(elsewhere if workers.is_used else None):
+            outcomes = survey_all(errors, args.commands, folder)
     print(as_markdown(outcomes))
-    sys.exit(int(not all(any(outcome.notices.values()) for outcome in outcomes)))
+    return int(not all(any(outcome.notices.values()) for outcome in outcomes))
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except InputError as error:
+        print(f"python -m data_tools.survey: {error}", file=sys.stderr)
+        sys.exit(2)

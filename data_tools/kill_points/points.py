@@ -175,7 +175,7 @@ def compiling(n_stages: int) -> Install:
 
 NOWHERE, OFTEN_SAVED = "nowhere", "nowhere, a checkpoint in each iteration"
 POINTS: dict[str, Install] = {
-    "start: photographs read": after("runs.settings:load_scene"),
+    "start: photographs read": after("runs.settings:build_scene"),
     "start: first state made": after("training.initial_state:initial_state"),
     "start: folder made": after("runs.run_folder:create"),
     "start: config.json written, not named": renaming(run_folder.CONFIG, is_done=False),

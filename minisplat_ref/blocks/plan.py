@@ -23,9 +23,11 @@ from minisplat_ref.blocks.coverage import Coarse, cover
 from minisplat_ref.blocks.grid import Block, divide, ground_plane
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.listing_file import select
+from minisplat_ref.io.scene import Listing
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import run_folder
-from minisplat_ref.runs.part import Part, Plane, box_from_json
+from minisplat_ref.runs.part import Part, Plane, Region, box_from_json
 from minisplat_ref.runs.scoring import renderer_of
 from minisplat_ref.runs.settings import Settings, load, load_model, recipe_of
 from minisplat_ref.types import Floats, Scene
@@ -125,12 +127,14 @@ def load_asked(folder: Path) -> Asked:
     return Asked(folder, load(folder / run_folder.BLOCKS), (shape[0], shape[1]))
 
 
-def make_plan(asked: Asked, scene: Scene, coarse: Coarse, centers: Floats) -> Plan:
+def make_plan(asked: Asked, listing: Listing, scene: Scene, coarse: Coarse, centers: Floats) -> Plan:
     """Plan by the coarse model, and write the parts of all blocks.
 
     Parameters
     ----------
     asked : Asked
+    listing : Listing
+        Of the whole.
     scene : Scene
         Of the coarse training, in its frame.
     coarse : Coarse
@@ -147,7 +151,8 @@ def make_plan(asked: Asked, scene: Scene, coarse: Coarse, centers: Floats) -> Pl
     blocks = divide(plane.coordinates(centers), asked.shape)
     masks, trained = cover(coarse, scene, plane, blocks)
     for block, own in zip(blocks, masks, strict=True):
-        Part(plane, block.region, own).write(asked.blocks_folder / f"{block.name}.json")
+        part = Part(Region(plane, block.region), select(listing, own.keys()), own)
+        part.write(asked.blocks_folder / f"{block.name}.json")
     n_views, cooling = len(scene.train_views), recipe_of(asked.settings).cooling
     whole = asked.settings.iterations
     gaussians = coarse.model.gaussians
@@ -169,10 +174,12 @@ def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> st
         return None
     a, b = asked.shape
     finer = f"{2 * a}x{b}" if a <= b else f"{a}x{2 * b}"
+    is_one = len(largest) == 1
+    which = "the largest block takes" if is_one else f"the {len(largest)} largest blocks take"
+    way_out = "begin again" if is_one else "give fewer --workers, or begin again"
     return (
-        f"the photographs and first Gaussians of {len(largest)} blocks take {sum(largest) / 1e3:.1f} GB, and"
-        f" {free_bytes / 1e9:.1f} GB are free: photographs will be read again and again; give fewer --workers, or begin"
-        f" again with a finer grid, such as --blocks {finer}"
+        f"{which} {sum(largest) / 1e3:.1f} GB with photographs and first Gaussians, and {free_bytes / 1e9:.1f}"
+        f" GB are free: photographs will be read again and again; {way_out} with a finer grid, such as --blocks {finer}"
     )
 
 

@@ -30,7 +30,7 @@ from minisplat_ref.io.frames import return_camera
 from minisplat_ref.memory import free_bytes
 from minisplat_ref.runs.cluster import Workers, carry_out_all
 from minisplat_ref.runs.run_folder import BLOCK_PLAN, has_begun
-from minisplat_ref.runs.settings import Settings, load_frame, load_photographs, recipe_of
+from minisplat_ref.runs.settings import Settings, list_photographs, load_frame, load_photographs, recipe_of
 from minisplat_ref.runs.trainings import HEADINGS, status_of, train_here, words_of, words_to_end
 from minisplat_ref.runs.worker import Job
 from minisplat_ref.training.schedule import Recipe
@@ -82,10 +82,11 @@ def plan_blocks(asked: Asked) -> Plan:
     if plan is not None:
         return plan
     frame = load_frame(asked.run_folder_of(COARSE))
-    scene = load_photographs(asked.coarse, frame)
+    listing = list_photographs(asked.coarse)
+    scene = load_photographs(asked.coarse, frame, listing)
     coarse = load_coarse(asked, scene)
     centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])  # [V, 3]
-    plan = make_plan(asked, scene, coarse, centers)
+    plan = make_plan(asked, listing, scene, coarse, centers)
     draw_plan(plan, centers, coarse.means, asked.folder / BLOCK_PLAN)
     save_plan(asked, plan)
     print(describe(asked, plan))

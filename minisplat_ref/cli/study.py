@@ -83,18 +83,46 @@ def _run_resumed(study: "Study", given: argparse.Namespace, words: Sequence[str]
             study.run(given)
         return 0
     workers = Workers(given.workers, given.cluster)
-    with handing_out(partial(_hand_out, workers, without_workers(words)) if workers.is_used else None):
+    with handing_out(partial(hand_out, workers, without_workers(words)) if workers.is_used else None):
         return study.run(given) or 0
 
 
-def _hand_out(workers: "Workers", words: list[str], folder: Path, numbers: Sequence[int]) -> None:
+def hand_out(
+    workers: "Workers",
+    words: list[str],
+    folder: Path,
+    numbers: Sequence[int],
+    noun: str = "training",
+    program: str = "minisplat_ref",
+) -> None:
+    """Have jobs of a command that continues in its folder carried out by workers.
+
+    Parameters
+    ----------
+    workers : Workers
+    words : list of str
+        Of the command, after the program's name; ``--job N`` is added for one job.
+    folder : Path
+    numbers : sequence of int
+        Of the jobs.
+    noun : str
+        What a job is called.
+    program : str
+        Module of the command.
+
+    Raises
+    ------
+    InputError
+        A job has failed, or as for :func:`minisplat_ref.runs.cluster.carry_out_all`.
+    """
     from minisplat_ref.runs.cluster import carry_out_all
     from minisplat_ref.runs.worker import Job
 
-    jobs = [Job(f"training {n + 1}", _words_of_job, (folder.resolve(), n, words)) for n in numbers]
+    where = folder.resolve()
+    jobs = [Job(f"{noun} {n + 1}", _words_of_job, (where, n, words), program=program) for n in numbers]
     code = carry_out_all(workers, jobs, folder, on_done=lambda job: print(f"{job.name}: ended", flush=True))
     if code:
-        raise InputError(f"a training has failed; what others measured is in {folder}, and the same command continues")
+        raise InputError(f"a {noun} has failed; what others measured is in {folder}, and the same command continues")
 
 
 def _words_of_job(folder: Path, number: int, words: list[str]) -> list[str] | None:

@@ -239,7 +239,8 @@ def _start(given: dict[str, Any]) -> int:
     compile_kernels(settings.backend)
     run_folder.create(folder)
     warn_of_scene(scene, settings.downscale, is_dense=recipe.starts_densely)
-    report_inventory(Path(settings.scene), scene, settings.model)
+    if settings.block is None:  # else the training of the whole has said so
+        report_inventory(Path(settings.scene), scene, settings.model)
     proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
     if proposal is not None:
         print(f"minisplat-ref: {proposal}", file=sys.stderr)
@@ -322,7 +323,7 @@ def _default_iterations(name: str) -> int:
 
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from what --init gives."""
-    from minisplat_ref.runs.part import read_part
+    from minisplat_ref.runs.part import read_region
     from minisplat_ref.runs.start import start_from
 
     start = start_from(settings.init, scene, recipe, settings.seed)
@@ -330,7 +331,7 @@ def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "Tra
         print(f"minisplat-ref: {notice}", file=sys.stderr)
     if start.source is not None:
         print(f"starts from {start.source}")
-    return start.state if settings.block is None else read_part(Path(settings.block)).crop(start.state)
+    return start.state if settings.block is None else read_region(Path(settings.block)).crop(start.state)
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:

@@ -1,14 +1,20 @@
 """Files in and out: scenes of photographs, Gaussians, images."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, load_colmap
+from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, list_colmap, load_colmap
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import load_ply, load_points, save_ply
-from minisplat_ref.io.transforms import BLENDER_FILES, SINGLE_FILE, find_transforms, load_transforms
+from minisplat_ref.io.scene import Listing, build_reading, build_scene
+from minisplat_ref.io.transforms import (
+    BLENDER_FILES,
+    SINGLE_FILE,
+    find_transforms,
+    list_transforms,
+    load_transforms,
+)
 from minisplat_ref.types import Floats, Scene
 
 __all__ = [
@@ -32,7 +38,6 @@ def load_scene(
     undistort: bool = False,
     as_photographed: bool = False,
     model: str | None = None,
-    only: Collection[str] | None = None,
 ) -> Scene:
     """Load a scene of photographs with cameras, whichever way it is described.
 
@@ -40,7 +45,7 @@ def load_scene(
     ----------
     path : str or Path
         Folder of a COLMAP scene or of a transforms.json (COLMAP wins where both are there), or a transforms.json file.
-    downscale, test_every, background, undistort, as_photographed, only
+    downscale, test_every, background, undistort, as_photographed
         See :func:`load_colmap` and :func:`load_transforms`.
     model : str, optional
         Folder of a COLMAP model, relative to ``path``, where there are several.
@@ -54,15 +59,19 @@ def load_scene(
     InputError
         If there is nothing that can be loaded, or what is there cannot.
     """
-    path = Path(path)
+    listing = list_scene(Path(path), test_every, model)
+    reading = build_reading(downscale, background, undistort, listing.alpha_is_mask, as_photographed)
+    return build_scene(listing, reading)
+
+
+def list_scene(path: Path, test_every: int, model: str | None = None) -> Listing:
+    """Return what :func:`load_scene` reads besides the photographs; arguments and errors are the same."""
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
-    options: dict[str, Any] = {"downscale": downscale, "test_every": test_every, "background": background}
-    options |= {"undistort": undistort, "as_photographed": as_photographed, "only": only}
     if find_model(path, model) is not None:
-        return load_colmap(path, model=model, **options)
+        return list_colmap(path, test_every, model)
     if find_transforms(path):
-        return load_transforms(path, **options)
+        return list_transforms(path, test_every)
     models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
     raise InputError(
         f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"

@@ -9,7 +9,7 @@ and images that COLMAP could not register.
 import re
 import struct
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from minisplat_ref.io.colmap_text import read_text, readable, text_names
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
 from minisplat_ref.io.names import name_inside, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, PointCloud, load_points
-from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
+from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing, split_photos
 from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
@@ -60,7 +60,6 @@ def load_colmap(
     undistort: bool = False,
     as_photographed: bool = False,
     model: str | None = None,
-    only: Collection[str] | None = None,
 ) -> Scene:
     """Load a COLMAP scene.
 
@@ -81,8 +80,6 @@ def load_colmap(
         Leave them as they are, with cameras that have ``optics``.
     model : str, optional
         Folder of the model, relative to ``path``, where there are several; the first of those above by default.
-    only : collection of str, optional
-        Names of the views to read; all by default.
 
     Returns
     -------
@@ -93,14 +90,18 @@ def load_colmap(
     InputError
         If a file is missing or damaged, a camera model is distorted, or an image does not fit its camera.
     """
-    path = Path(path)
-    reading = build_reading(downscale, background, undistort, True, as_photographed, only)
+    reading = build_reading(downscale, background, undistort, True, as_photographed)
+    return build_scene(list_colmap(Path(path), test_every, model), reading)
+
+
+def list_colmap(path: Path, test_every: int, model: str | None = None) -> Listing:
+    """Return what :func:`load_colmap` reads besides the photographs; arguments and errors are the same."""
     reconstruction = read_model(path, model)
     train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every)
     points, colors = _points(reconstruction)
     if not len(points):
         points, colors = _points_beside(path, find_model(path, model))
-    return build_scene(path, train_photos, test_photos, points, colors, reading)
+    return make_listing(path, train_photos, test_photos, points, colors, alpha_is_mask=True)
 
 
 def has_model(folder: Path) -> bool:

@@ -7,7 +7,7 @@ only sizes are checked here, and pixels are read on demand (:mod:`minisplat_ref.
 
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,6 +67,23 @@ class Photo(NamedTuple):
         return self.folder / self.file
 
 
+class Listing(NamedTuple):
+    """A scene before its photographs are read."""
+
+    source: Path
+    """The path that the user gave; errors name it, and its folder names the scene."""
+    train_photos: Sequence[Photo]
+    test_photos: Sequence[Photo]
+    names: Sequence[str]
+    """Of the views, those of training first."""
+    points: Floats
+    """[P, 3] world frame."""
+    point_colors: NDArray[np.uint8]
+    """[P, 3]"""
+    alpha_is_mask: bool
+    """As :attr:`Reading.alpha_is_mask`, which the format of the scene decides."""
+
+
 class Reading(NamedTuple):
     """How photographs become views."""
 
@@ -80,8 +97,6 @@ class Reading(NamedTuple):
     """An alpha channel masks the loss; False composites it onto the background."""
     as_photographed: bool = False
     """Leave photographs of other lenses as they are, and describe the lens by the camera's ``optics``."""
-    only: Collection[str] | None = None
-    """Names of the views to read, of a part of a scene; None for all."""
 
 
 def build_reading(
@@ -90,7 +105,6 @@ def build_reading(
     undistort: bool,
     alpha_is_mask: bool,
     as_photographed: bool = False,
-    only: Collection[str] | None = None,
 ) -> Reading:
     """Check the arguments that all loaders share."""
     if downscale < 1 or downscale != int(downscale):
@@ -100,7 +114,7 @@ def build_reading(
         raise InputError(f"background is {background}; it must be three numbers in [0, 1]")
     if undistort and as_photographed:
         raise InputError("photographs are either undistorted or read as they are: leave out one of the two")
-    return Reading(int(downscale), color, undistort, alpha_is_mask, as_photographed, only)
+    return Reading(int(downscale), color, undistort, alpha_is_mask, as_photographed)
 
 
 def split_photos(photos: Sequence[Photo], test_every: int) -> tuple[list[Photo], list[Photo]]:
@@ -113,26 +127,27 @@ def split_photos(photos: Sequence[Photo], test_every: int) -> tuple[list[Photo],
     return train, [photo for photo, held_out in zip(ordered, is_test, strict=True) if held_out]
 
 
-def build_scene(
+def make_listing(
     source: Path,
     train_photos: Sequence[Photo],
     test_photos: Sequence[Photo],
     points: Floats,
     point_colors: NDArray[np.uint8],
-    reading: Reading,
-) -> Scene:
+    *,
+    alpha_is_mask: bool,
+) -> Listing:
+    """Name the views; raise an InputError if two photographs have one name."""
+    names = _view_names((*train_photos, *test_photos), source)
+    return Listing(source, train_photos, test_photos, names, points, point_colors, alpha_is_mask)
+
+
+def build_scene(listing: Listing, reading: Reading) -> Scene:
     """Build the scene, with all pixels in memory if they take a moderate part of it.
 
     Parameters
     ----------
-    source : Path
-        The path that the user gave; errors name it, and its folder names the scene.
-    train_photos, test_photos : sequence of Photo
-        At least two training photographs.
-    points : ndarray of shape (P, 3)
-        World frame.
-    point_colors : ndarray of shape (P, 3)
-        uint8.
+    listing : Listing
+        Of at least two training photographs.
     reading : Reading
         How photographs become views.
 
@@ -145,8 +160,7 @@ def build_scene(
     InputError
         If there are too few views, a camera is not usable, or an image is missing or does not fit its camera.
     """
-    if reading.only is not None:
-        train_photos, test_photos = _select(train_photos, test_photos, reading.only, source)
+    source, train_photos, test_photos, names, points, point_colors, _ = listing
     photos = (*train_photos, *test_photos)
     if len(train_photos) < TRAIN_VIEWS_MIN:
         raise InputError(
@@ -158,7 +172,6 @@ def build_scene(
     _check_points(points, source)
     memory.check_photograph(source, max(_n_pixels(photo) for photo in photos), reading.downscale)
     _check_places(source, [photo.camera for photo in train_photos])
-    names = _view_names(photos, source)
     shelf_bytes = memory.shelf_bytes(sum(map(_n_bytes, photos)) / reading.downscale**2)
     if shelf_bytes is None:
         views = tuple(read_view(photo, name, reading) for photo, name in _show_progress(photos, names))
@@ -183,20 +196,6 @@ def build_scene(
         background=reading.background,
         extent=camera_extent(cameras),
     )
-
-
-def _select(
-    train_photos: Sequence[Photo], test_photos: Sequence[Photo], only: Collection[str], source: Path
-) -> tuple[list[Photo], list[Photo]]:
-    """Return the photographs whose views have one of the names."""
-    photos = (*train_photos, *test_photos)
-    names = _view_names(photos, source)
-    if absent := set(only).difference(names):
-        raise InputError(f"{source}: photograph {min(absent)} is not there any more, and a part of the scene needs it")
-    chosen = [name in only for name in names]
-    n = len(train_photos)
-    train = [photo for photo, is_chosen in zip(train_photos, chosen[:n], strict=True) if is_chosen]
-    return train, [photo for photo, is_chosen in zip(test_photos, chosen[n:], strict=True) if is_chosen]
 
 
 def _check_places(source: Path, cameras: Sequence[Camera]) -> None:
@@ -445,7 +444,7 @@ def _view_names(photos: Sequence[Photo], source: Path) -> list[str]:
     names = [file.name for file in files]
     if len(set(names)) < len(names):
         names = ["_".join(file.parts) for file in files]
-    name, count = Counter(names).most_common(1)[0]
-    if count > 1:
-        raise InputError(f"{source}: {count} images are called {name}; give each its own name, suffix aside")
+    for name, count in Counter(names).most_common(1):
+        if count > 1:
+            raise InputError(f"{source}: {count} images are called {name}; give each its own name, suffix aside")
     return names

@@ -16,7 +16,7 @@ exposure, rolling shutter.
 import math
 import reprlib
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
 from minisplat_ref.io.names import is_file, path_beside, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, load_points
-from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
+from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing, split_photos
 from minisplat_ref.types import Camera, Floats, Scene
 
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
@@ -46,7 +46,6 @@ def load_transforms(
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
     as_photographed: bool = False,
-    only: Collection[str] | None = None,
 ) -> Scene:
     """Load a scene described by transforms.json.
 
@@ -66,8 +65,6 @@ def load_transforms(
         Warp images with lens distortion to a pinhole, instead of refusing them.
     as_photographed : bool
         Leave them as they are, with cameras that have ``optics``.
-    only : collection of str, optional
-        Names of the views to read; all by default.
 
     Returns
     -------
@@ -78,8 +75,12 @@ def load_transforms(
     InputError
         If a file is missing or malformed, no image exists, there is distortion, or an image does not fit its camera.
     """
-    path = Path(path)
-    reading = build_reading(downscale, background, undistort, False, as_photographed, only)
+    reading = build_reading(downscale, background, undistort, False, as_photographed)
+    return build_scene(list_transforms(Path(path), test_every), reading)
+
+
+def list_transforms(path: Path, test_every: int) -> Listing:
+    """Return what :func:`load_transforms` reads besides the photographs; arguments and errors are the same."""
     files = find_transforms(path)
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")
@@ -92,7 +93,7 @@ def load_transforms(
     cloud = NO_POINTS if points_file is None else load_points(points_file)
     if cloud.dropped:
         warnings.warn(f"{points_file}: {cloud.dropped} and left out", stacklevel=2)
-    return build_scene(path, train_photos, test_photos, cloud.points, cloud.colors, reading)
+    return make_listing(path, train_photos, test_photos, cloud.points, cloud.colors, alpha_is_mask=False)
 
 
 def find_transforms(path: Path) -> tuple[Path, ...]:

@@ -1,4 +1,4 @@
-"""Run a command of this program in a process that ends with the one that started it: ``-m`` of a worker's children.
+"""Run a module in a process that ends with the one that started it: ``-m`` of a worker's children.
 
 A worker that is killed closes the pipe that is the standard input here. The command must not continue then: another
 worker takes its task over, and both would write into one folder. It ends at once, like the worker itself, and what
@@ -22,5 +22,6 @@ def _end_with_parent() -> None:
 
 if __name__ == "__main__":
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    sys.argv[0] = "minisplat-ref"
-    runpy.run_module("minisplat_ref", run_name="__main__", alter_sys=True)
+    module = sys.argv.pop(1)
+    sys.argv[0] = module.replace("_", "-")
+    runpy.run_module(module, run_name="__main__", alter_sys=True)

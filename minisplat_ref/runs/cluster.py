@@ -164,7 +164,9 @@ def _client(workers: Workers) -> Iterator[Any]:
             stack.enter_context(cluster)
             yield stack.enter_context(distributed.Client(cluster))
             return
-        yield stack.enter_context(_connect(workers.address))
+        client = stack.enter_context(_connect(workers.address))
+        stack.enter_context(client.as_current())  # for as_completed and wait, which take no client
+        yield client
 
 
 def _connect(address: str) -> Any:

@@ -1,7 +1,9 @@
 """A part of a scene that is trained for itself: which photographs, which of their pixels, and where its Gaussians are.
 
-A part is two files, ``NAME.json`` and, beside it, ``NAME.npz`` with the masks. Places are in the frame of the scene's
-files, on a plane: a point x has the coordinates ``axes (x - origin)``.
+A part is two files, ``NAME.json`` and, beside it, ``NAME.npz`` with cameras, points and masks. They have all that a
+training needs of the scene besides its photographs: the model of a large scene is read by whoever plans its parts, and
+not again for each. Places are in the frame of the scene's files, on a plane: a point x has the coordinates
+``axes (x - origin)``.
 """
 
 import math
@@ -12,16 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io import listing_file
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.frames import return_points
 from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
+from minisplat_ref.io.scene import Listing
 from minisplat_ref.io.stored_views import Pixels, StoredView
 from minisplat_ref.runs.run_folder import read_json_object, write_json
 from minisplat_ref.strategy.ops import contiguous, take
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Bools, Floats, Scene, View, number_views
+from minisplat_ref.types import Bools, Floats, Scene, View
 
 WAY_OUT = "plan the blocks again, into another folder"
 
@@ -56,12 +60,28 @@ class Box(NamedTuple):
         return [[value if math.isfinite(value) else None for value in corner] for corner in self]
 
 
+class Region(NamedTuple):
+    """Where the first Gaussians of a part are."""
+
+    plane: Plane
+    box: Box
+
+    def crop(self, state: TrainState) -> TrainState:
+        """Keep of a state before its first iteration the Gaussians of the region."""
+        means = return_points(state.gaussians.means, state.frame)
+        rows = self.box.contains(self.plane.coordinates(means))
+        state.gaussians = contiguous(take(state.gaussians, rows))
+        state.adam = zero_moments(state.gaussians)
+        return state
+
+
 class Part(NamedTuple):
     """What one block trains on."""
 
-    plane: Plane
-    region: Box
-    """Where its first Gaussians are: the block with its surroundings."""
+    region: Region
+    """The block with its surroundings."""
+    listing: Listing
+    """Of its photographs, all for training, and of the points that they show."""
     masks: Mapping[str, Bools]
     """[H, W] by the name of the photograph: True where it shows the region, or nothing at all."""
 
@@ -69,36 +89,25 @@ class Part(NamedTuple):
         """Write both files; ``path`` is that of the JSON, which comes last."""
         with replacing(path.with_suffix(".npz")) as temporary, open(temporary, "wb") as file:
             bits = {f"{k:05d}": np.packbits(mask) for k, mask in enumerate(self.masks.values())}
-            np.savez(file, allow_pickle=False, **bits)
+            np.savez(file, allow_pickle=False, **bits, **listing_file.to_arrays(self.listing))
         content = {
-            "origin": self.plane.origin.tolist(),
-            "axes": self.plane.axes.tolist(),
-            "region": self.region.to_json(),
-            "photographs": [[name, *mask.shape] for name, mask in self.masks.items()],
+            "origin": self.region.plane.origin.tolist(),
+            "axes": self.region.plane.axes.tolist(),
+            "region": self.region.box.to_json(),
+            "masks": [[name, *mask.shape] for name, mask in self.masks.items()],
+            **listing_file.to_json(self.listing),
         }
         write_json(path, content)
 
-    def narrow(self, scene: Scene) -> Scene:
-        """Return the scene, in the frame of its files, with masks, and with the points that its photographs show.
-
-        Parameters
-        ----------
-        scene : Scene
-            With the photographs of the part and no others, all for training.
+    def hide(self, scene: Scene) -> Scene:
+        """Return the scene that was built of the listing, with masks.
 
         Raises
         ------
         InputError
             A photograph has another size than its mask.
         """
-        views = [self._masked(view) for view in scene.train_views]
-        known = [view.point_ids for view in views if view.point_ids is not None]
-        if len(known) < len(views):  # nobody knows which points they show
-            return scene._replace(train_views=number_views(views))
-        rows = np.unique(np.concatenate(known))  # [Q]
-        views = [view._replace(point_ids=np.searchsorted(rows, ids)) for view, ids in zip(views, known, strict=True)]
-        points, colors = scene.points[rows], scene.point_colors[rows]
-        return scene._replace(train_views=number_views(views), points=points, point_colors=colors)
+        return scene._replace(train_views=tuple(self._masked(view) for view in scene.train_views))
 
     def _masked(self, view: View) -> View:
         mask = self.masks[view.name]
@@ -115,34 +124,44 @@ class Part(NamedTuple):
             return view.change(hide)
         return view._replace(mask=hide(Pixels(view.image, view.mask)).mask)
 
-    def crop(self, state: TrainState) -> TrainState:
-        """Keep of a state before its first iteration the Gaussians of the region."""
-        means = return_points(state.gaussians.means, state.frame)
-        rows = self.region.contains(self.plane.coordinates(means))
-        state.gaussians = contiguous(take(state.gaussians, rows))
-        state.adam = zero_moments(state.gaussians)
-        return state
 
-
-def read_part(path: Path) -> Part:
+def read_part(path: Path, source: Path) -> Part:
     """Read what :meth:`Part.write` wrote.
+
+    Parameters
+    ----------
+    path : Path
+        Of the JSON.
+    source : Path
+        Of the scene.
 
     Raises
     ------
     InputError
         A file is missing, or is not what it should be.
     """
+    region, content = read_region(path), read_json_object(path)
+    try:
+        arrays = read_npz(path.with_suffix(".npz"), WAY_OUT)
+        return Part(region, listing_file.from_files(source, content, arrays), _unpack(content["masks"], arrays))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _of_another_version(path, error) from error
+
+
+def read_region(path: Path) -> Region:
+    """Read of a part only where it is; errors are those of :func:`read_part`."""
     content = read_json_object(path)
     origin, axes = as_array(content.get("origin"), (3,)), as_array(content.get("axes"), (2, 3))
-    sizes = content.get("photographs")
-    try:
-        box = box_from_json(content["region"])
-        masks = _unpack(sizes, read_npz(path.with_suffix(".npz"), WAY_OUT))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is not a part of a scene of this version ({error}): {WAY_OUT}") from error
     if origin is None or axes is None:
         raise InputError(f"{path} has no plane: {WAY_OUT}")
-    return Part(Plane(origin, axes), box, masks)
+    try:
+        return Region(Plane(origin, axes), box_from_json(content["region"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise _of_another_version(path, error) from error
+
+
+def _of_another_version(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path} is not a part of a scene of this version ({error}): {WAY_OUT}")
 
 
 def box_from_json(content: Any) -> Box:

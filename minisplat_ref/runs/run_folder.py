@@ -8,19 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io import run_files
 from minisplat_ref.io.atomic import is_part, remove_parts, replacing
 from minisplat_ref.io.json_file import read_json
 
-CONFIG = "config.json"  # everything needed to run it again
-POINT_CLOUD = "point_cloud.ply"  # the Gaussians
-SHARED = "shared.npz"  # parameters that belong to no Gaussian, if there are any
-METRICS = "metrics.json"  # what was measured on the test views
+CONFIG = run_files.CONFIG  # everything needed to run it again
+POINT_CLOUD = run_files.POINT_CLOUD  # the Gaussians
+SHARED = run_files.SHARED  # parameters that belong to no Gaussian, if there are any
+METRICS = run_files.METRICS  # what was measured on the test views
 LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
 EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
-CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
+CAMERAS = (
+    run_files.CAMERAS
+)  # cameras of all views and hashes of their photographs: to render without them, to know them
 DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
 REPORT = "report.html"  # all of it to look at
 BLOCK_PLAN = "plan.png"  # the blocks seen from above

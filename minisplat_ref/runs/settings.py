@@ -14,7 +14,7 @@ from minisplat_ref.backends import BACKENDS, CUDA
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
-from minisplat_ref.io import load_scene
+from minisplat_ref.io import list_scene
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.frames import (
     Unit,
@@ -29,6 +29,7 @@ from minisplat_ref.io.frames import (
 from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.io.scene import Listing, build_reading, build_scene
 from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.mechanisms.cameras.models import check_optics
 from minisplat_ref.methods import RECIPES
@@ -276,7 +277,12 @@ def _read_config(folder: Path) -> dict[str, Any]:
     return read_json_object(folder / CONFIG)
 
 
-def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
+def list_photographs(settings: Settings) -> Listing:
+    """Return what is known of the whole scene of a run before its photographs are read; errors as for the scene."""
+    return list_scene(Path(settings.scene), settings.test_every, settings.model)
+
+
+def load_photographs(settings: Settings, frame: Frame | None = None, listing: Listing | None = None) -> Scene:
     """Load the scene of a run as it was loaded for the training.
 
     Parameters
@@ -284,6 +290,8 @@ def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
     settings : Settings
     frame : Frame, optional
         That of the run; by default the one that suits the scene.
+    listing : Listing, optional
+        Of the whole scene, for who needs it, too; by default it is read, or that of the part.
 
     Raises
     ------
@@ -291,18 +299,18 @@ def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
         See :func:`minisplat_ref.io.load_scene`.
     """
     owner = owner_of(settings.recipe, settings.extension) or CORE
-    part = None if settings.block is None else read_part(Path(settings.block))
-    scene = load_scene(
-        settings.scene,
-        downscale=settings.downscale,
-        test_every=settings.test_every,
-        background=settings.background,
-        undistort=settings.undistort,
+    part = None if settings.block is None else read_part(Path(settings.block), Path(settings.scene))
+    if listing is None:
+        listing = list_photographs(settings) if part is None else part.listing
+    reading = build_reading(
+        settings.downscale,
+        settings.background,
+        settings.undistort,
+        listing.alpha_is_mask,
         as_photographed=owner.representation.takes_optics and not settings.undistort,
-        model=settings.model,
-        only=None if part is None else part.masks.keys(),
     )
-    scene = scene if part is None else part.narrow(scene)
+    scene = build_scene(listing, reading)
+    scene = scene if part is None else part.hide(scene)
     for view in (*scene.train_views, *scene.test_views):
         try:
             check_optics(view.camera)

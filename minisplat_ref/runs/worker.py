@@ -39,11 +39,13 @@ class Job(NamedTuple):
     name: str
     """For people."""
     choose: Callable[..., Sequence[str] | None]
-    """Returns the words after ``minisplat-ref``, or None if there is nothing left to do; called on the worker."""
+    """Returns the words after the program's name, or None if there is nothing left to do; called on the worker."""
     arguments: tuple[Any, ...]
     """Of ``choose``: names, numbers and paths."""
     folder: Path | None = None
     """Absolute; the folder that the command holds, which no other process may be writing into when it begins."""
+    program: str = "minisplat_ref"
+    """The module that is run, which is there in the working folder of the commands or is installed."""
 
 
 class Site(NamedTuple):
@@ -105,7 +107,7 @@ def carry_out(job: Job, site: Site) -> Outcome:
         return Outcome(0)
     environment = {**os.environ, **{name: os.environ.get("NUMBA_NUM_THREADS", "1") for name in THREADS}}
     with tempfile.TemporaryFile() as said:
-        code = _run([*ATTACHED, *words], site, env=environment, stdout=said, stderr=subprocess.STDOUT)
+        code = _run([*ATTACHED, job.program, *words], site, env=environment, stdout=said, stderr=subprocess.STDOUT)
         said.seek(max(0, said.tell() - SAID_BYTES))
         return Outcome(code, said.read().decode("utf-8", errors="replace"))
 

@@ -62,6 +62,7 @@ def resume(
     jobs: Sequence[Mapping[str, Any]],
     measure: Callable[..., Iterable[Mapping[str, Any]]],
     warm_up: Callable[[list[Mapping[str, Any]]], None] = lambda missing: None,
+    nouns: str = "trainings",
 ) -> list[dict[str, Any]]:
     """Measure the jobs that have no record in the folder, and return all its records.
 
@@ -77,6 +78,8 @@ def resume(
         Returns the further entries of each record of a job.
     warm_up : callable
         Called with the missing jobs before the first, so that none counts the time of compiling.
+    nouns : str
+        What the jobs are called where their progress is shown.
 
     Raises
     ------
@@ -85,7 +88,7 @@ def resume(
     """
     if (number := JOB.get()) is not None:
         _measure_one(folder, number, jobs[number], measure, warm_up)
-    records = _read_records(folder, settings)
+    records = _read_records(folder, settings, nouns)
     records += _take_in(folder, range(len(jobs)), jobs)  # of a call that was interrupted
     missing = [
         number for number, job in enumerate(jobs) if not any(job.items() <= record.items() for record in records)
@@ -94,7 +97,7 @@ def resume(
         hand_out(folder, missing)
         return records + _take_in(folder, missing, jobs)
     warm_up([jobs[number] for number in missing])
-    for number in with_progress(missing, "trainings"):
+    for number in with_progress(missing, nouns):
         job = jobs[number]
         for measured in measure(**job):
             records.append({**job, **measured})
@@ -136,7 +139,7 @@ def _append(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
         file.writelines(json.dumps(record) + "\n" for record in records)
 
 
-def _read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _read_records(folder: Path, settings: Mapping[str, Any], nouns: str) -> list[dict[str, Any]]:
     path = folder / RUNS
     if not folder.exists():
         folder.mkdir(parents=True)
@@ -146,5 +149,5 @@ def _read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, A
         raise InputError(f"{folder} exists and is not of this study: give another --out")
     first, *lines = path.read_text(encoding="utf-8").splitlines()
     if json.loads(first) != settings:
-        raise InputError(f"{folder} holds trainings of {first}: give another --out, or the same settings")
+        raise InputError(f"{folder} holds {nouns} of {first}: give another --out, or the same settings")
     return [json.loads(line) for line in lines]

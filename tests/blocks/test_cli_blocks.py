@@ -98,6 +98,31 @@ def test_blocks_start_from_the_coarse_model_in_their_regions(finished):
     assert asked.shape == (2, 1)
 
 
+def test_a_block_reads_nothing_of_the_model(scene_folder, finished, tmp_path, monkeypatch):
+    """Neither to begin nor to continue: its folder is away while blocks train, with the same bytes in the end."""
+    out, model, hidden = tmp_path / "out", scene_folder / "sparse", scene_folder / "hidden"
+    trained = []
+
+    def train_without_model(words):
+        if "blocks/coarse" in words[words.index("--out") + 1]:
+            return in_process(words)
+        model.rename(hidden)
+        try:
+            trained.append(words)
+            return in_process(words)
+        finally:
+            hidden.rename(model)
+
+    monkeypatch.setattr(train_module, "train_here", train_without_model)
+    assert begin(scene_folder, out) == 0
+    assert len(trained) == 2 and same_files(out, finished)
+    model.rename(hidden)
+    try:
+        assert main(["train", "--resume", str(out / "blocks" / "1-0"), "--iterations", "20"]) == 0
+    finally:
+        hidden.rename(model)
+
+
 SLOWLY = [pytest.param(phase, marks=pytest.mark.slow) for phase in ("coarse", "1-0")]
 
 
@@ -160,8 +185,10 @@ def test_memory_is_foreseen(finished):
     large = plan._replace(blocks=tuple(p._replace(megabytes=m) for p, m in zip(plan.blocks, (300, 500), strict=True)))
     assert too_large(asked, large, 2, 800e6) is None and too_large(asked, large, 1, 500e6) is None
     sentence = too_large(asked, large, 2, 799e6)
-    assert "2 blocks take 0.8 GB, and 0.8 GB are free" in sentence and "such as --blocks 2x2" in sentence
-    assert "1 blocks take 0.5 GB" in too_large(asked._replace(shape=(1, 2)), large, 1, 1e6)
+    assert sentence.startswith("the 2 largest blocks take 0.8 GB with photographs and first Gaussians, and 0.8 GB are")
+    assert "; give fewer --workers, or begin again with a finer grid, such as --blocks 2x2" in sentence
+    alone = too_large(asked._replace(shape=(1, 2)), large, 1, 1e6)
+    assert alone.startswith("the largest block takes 0.5 GB with photographs") and "--workers" not in alone
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -55,6 +57,29 @@ def test_workers_give_the_same_bytes(scene_folder, in_turn, tmp_path, n):
     out = compare(scene_folder, tmp_path / "out", "--workers", str(n))
     assert results(out) == results(in_turn)
     assert not list(out.glob(f"{cluster.TOKEN}*"))
+
+
+def test_a_scheduler_elsewhere_gives_the_same_bytes(scene_folder, in_turn, tmp_path):
+    """Scheduler and worker are programs of their own, as on other machines."""
+    contact, plain = tmp_path / "scheduler.json", ["--scheduler-file", str(tmp_path / "scheduler.json")]
+    commands = (
+        ["dask_scheduler", *plain, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"],
+        ["dask_worker", *plain, "--nthreads", "1", "--no-dashboard"],
+    )
+    programs = []
+    try:
+        for module, *words in commands:
+            call = [sys.executable, "-m", f"distributed.cli.{module}", *words]
+            programs.append(subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path))
+            while not contact.exists():
+                assert programs[0].poll() is None
+                time.sleep(0.05)
+        out = compare(scene_folder, tmp_path / "out", "--cluster", json.loads(contact.read_text())["address"])
+    finally:
+        for program in reversed(programs):
+            program.terminate()
+            program.wait()
+    assert results(out) == results(in_turn)
 
 
 def test_a_killed_worker_loses_nothing(scene_folder, in_turn, tmp_path, monkeypatch):

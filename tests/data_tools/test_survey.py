@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from data_tools import survey as module
-from data_tools.survey import as_markdown, plant_in_copy, plant_in_function, survey
+from data_tools.survey import as_markdown, main, plant_in_copy, plant_in_function, survey
 from data_tools.survey_errors import ERRORS
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference import adam, hits
 from minisplat_ref.reference.adam import adam_update
+from minisplat_ref.runs import cluster
 
 BY_NAME = {error.what: error for error in ERRORS}
 
@@ -66,6 +67,59 @@ def test_an_exception_is_noticed():
     broken = BY_NAME["continues where T equals the stop"]._replace(wrong="1 / 0 + conventions")
     assert survey(broken, ["compare reference"]).notices == {"compare reference": True}
     assert "/ 0" not in inspect.getsource(hits.goes_on) and hits.goes_on(np.ones(1), GSPLAT_MAIN)
+
+
+ADAM = ["--only", "*mean", "--commands", "Adam"]  # of three errors
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(module, "COMMANDS", {"Adam": ("compare", "reference", "--scene", "equality")})
+
+
+def test_workers_give_the_same_table(quick, tmp_path, monkeypatch, capsys):
+    """Jobs are carried out here, the last one first, in place of workers' processes."""
+    assert main(ADAM) == 1
+    in_turn = capsys.readouterr()
+    assert "beta2 for the mean: Adam\n" in in_turn.err and "PASSES EVERY COMMAND" in in_turn.err
+
+    def carry_out_all(workers, jobs, folder, inputs=(), on_done=None):
+        assert workers.n == 2 and len(jobs) == 3
+        for job in reversed(jobs):
+            words = job.choose(*job.arguments)
+            assert job.program == "data_tools.survey" and main(words) == 0
+            assert job.choose(*job.arguments) is None, "it has been done"
+        return 0
+
+    out = str(tmp_path / "out")
+    with monkeypatch.context() as patch:
+        patch.setattr(cluster, "carry_out_all", carry_out_all)
+        assert main([*ADAM, "--out", out, "--workers", "2"]) == 1
+    assert capsys.readouterr().out == in_turn.out
+    monkeypatch.setattr(module, "survey", None)  # nothing is surveyed twice
+    assert main([*ADAM, "--out", out]) == 1
+    assert capsys.readouterr().out == in_turn.out
+    monkeypatch.setattr(module, "ERRORS", ERRORS[:-1])
+    with pytest.raises(InputError, match=r"holds errors of .* give another --out"):
+        main([*ADAM, "--out", out])
+
+
+def test_workers_need_a_folder(capsys):
+    with pytest.raises(SystemExit):
+        main(["--workers", "2"])
+    assert "give --out DIR" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_two_workers_give_the_same_bytes(tmp_path):
+    pytest.importorskip("distributed")
+    call = [sys.executable, "-m", "data_tools.survey", "--only", "*mean", "--commands", "compare reference"]
+    tables = [
+        subprocess.run([*call, *options], cwd=Path(__file__).parents[2], capture_output=True, check=False)
+        for options in ([], ["--out", str(tmp_path / "out"), "--workers", "2"])
+    ]
+    assert [table.returncode for table in tables] == [1, 1], tables[1].stderr
+    assert tables[0].stdout in tables[1].stdout and tables[0].stdout.startswith(b"| planted error")
 
 
 def test_the_script_names_its_commands():

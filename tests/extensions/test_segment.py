@@ -265,7 +265,7 @@ BAD = {
     "background": (None, ["--remove", "0"], "--remove 0: the masks have 2, 5, 6, 9"),
     "bias": (None, ["--bias", "1.5"], "--bias is 1.5: give a number from -1 to 1"),
     "suffix": (None, ["--out", "labelled.spz"], "labelled.spz is not named like a PLY"),
-    "cameras": (None, ["--cameras", "no.json"], "no.json is not there"),
+    "cameras": (None, ["--cameras", "no.json"], "no.json: cannot be read (No such file"),
     "folder": (None, ["--masks", "no"], "no is no folder"),
     "empty": (None, ["--masks", "run"], "run holds no PNG"),
 }

@@ -7,6 +7,7 @@ from typing import Any
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.antialiasing.method import EPS2D, FilteredGaussians, apply_filters
 from minisplat_ref.io.ply import further_properties, load_ply, read_label, save_ply
+from minisplat_ref.io.run_files import model_file
 
 DESCRIPTION = """\
 Write the Gaussians of a run of recipe antialiasing for viewers that do not know
@@ -42,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The model has no filters or cannot be read, or the PLY to write is the one that is read, or no PLY.
     """
-    file = args.model / "point_cloud.ply" if args.model.is_dir() else args.model
+    file = model_file(args.model)
     if args.out.suffix.lower() != ".ply":
         raise InputError(f"{args.out} is not named like a PLY: give a name that ends in .ply, and convert that")
     if "filter_sigmas" not in further_properties(file):

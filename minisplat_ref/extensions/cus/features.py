@@ -36,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.atomic import making_folder
     from minisplat_ref.io.checkpoint import load_checkpoint
     from minisplat_ref.io.frames import place_camera
+    from minisplat_ref.io.run_files import CAMERAS
     from minisplat_ref.rendering import Request
     from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
     from minisplat_ref.types import Model, view_from
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{folder} was trained by recipe {recipe}, without features: train with --recipe {CUS.name}")
     bundles, frame = read_bundles(checkpoint, arrays, Anchors), read_frame(checkpoint, metadata)
     model = Model(bundles.gaussians, bundles.shared)
-    found = viewpoints.read(folder / "cameras.json")
+    found = viewpoints.read(folder / CAMERAS)
     with making_folder(args.out) as out:
         for viewpoint in found:
             view = view_from(place_camera(viewpoint.camera, frame), name=viewpoint.name)

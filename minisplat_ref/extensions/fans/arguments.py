@@ -8,6 +8,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.mesh_files import is_fans, load_fans
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, check_shape, convert_gaussians
 from minisplat_ref.io.ply import load_ply
+from minisplat_ref.io.run_files import model_file
 from minisplat_ref.types import Gaussians
 
 DEFAULT = FanShape()
@@ -57,7 +58,7 @@ def load_gaussians(path: Path) -> Gaussians:
     InputError
         There is no PLY of Gaussians, or none in it.
     """
-    gaussians: Gaussians = load_ply(_file(path))
+    gaussians: Gaussians = load_ply(model_file(path))
     if len(gaussians.means) == 0:
         raise InputError(f"{path} holds no Gaussians: give a model that has been trained")
     return gaussians
@@ -71,14 +72,10 @@ def load_as_fans(path: Path, shape: FanShape) -> Fans:
     InputError
         There is no PLY of either, or none in it.
     """
-    file = _file(path)
+    file = model_file(path)
     if not is_fans(file):
         return convert_gaussians(load_gaussians(path), shape)
     fans = load_fans(file)
     if len(fans.means) == 0:
         raise InputError(f"{path} holds no fans: give a model that has been trained")
     return fans
-
-
-def _file(path: Path) -> Path:
-    return path / "point_cloud.ply" if path.is_dir() else path

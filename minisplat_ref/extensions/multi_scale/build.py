@@ -44,14 +44,14 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The PLY or the cameras cannot be used, or a number is out of range.
     """
-    from minisplat_ref.io import viewpoints
+    from minisplat_ref.io.run_files import read_cameras
 
     if not (1 < args.factor <= 1024 and 1 <= args.levels <= 16 and args.min_coverage > 0):
         raise InputError("give a --factor above 1, 1 to 16 --levels, and a --min-coverage above 0")
     gaussians = load_ply(args.ply)
     if "cells_0" in further_properties(args.ply):
         raise InputError(f"{args.ply} has levels already: give a scene that was trained without any")
-    views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
+    views = read_cameras(args.ply, args.cameras)
     cameras = [view.camera for view in views if view.split != "test"]
     levels = level_zero(gaussians, np.random.default_rng(0))
     if len(gaussians.means) > 0:

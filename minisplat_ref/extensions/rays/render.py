@@ -17,6 +17,7 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.ply import load_ply, read_label
+from minisplat_ref.io.run_files import CAMERAS, model_file
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Floats, Model
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     if not ((background >= 0) & (background <= 1)).all():
         raise InputError(f"--background is {' '.join(f'{x:g}' for x in background)}: give three numbers from 0 to 1")
     around = surroundings.read(args.scene)
-    file = args.model / "point_cloud.ply" if args.model.is_dir() else args.model
+    file = model_file(args.model)
     gaussians = load_ply(file)
     warn_of_another(file, read_label(file), "rays", "rays render")
     whitened = whiten_model(Model(gaussians))
@@ -95,7 +96,7 @@ def _views(args: argparse.Namespace, means: Floats) -> list[viewpoints.Viewpoint
     """Return the cameras that are given, those of the run's test views, or an orbit."""
     if args.cameras is not None:
         return viewpoints.read(args.cameras)
-    path = args.model / "cameras.json"
+    path = args.model / CAMERAS
     if args.model.is_dir() and path.exists():
         known = viewpoints.read(path)
         return [view for view in known if view.split == "test"] or known

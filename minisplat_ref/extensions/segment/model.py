@@ -8,11 +8,11 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, load_extension
-from minisplat_ref.io import viewpoints
 from minisplat_ref.io.frames import frame_of_means, place_camera, place_population
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import further_properties, read_label, save_ply
 from minisplat_ref.io.ply_file import read_vertices
+from minisplat_ref.io.run_files import model_file, read_cameras
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.representation import nothing_shared
@@ -46,7 +46,7 @@ def read_subject(path: Path, cameras: Path | None = None) -> Subject:
     InputError
         There is no model or there are no cameras, or the renderer needs what no PLY holds.
     """
-    file = path / "point_cloud.ply" if path.is_dir() else path
+    file = model_file(path)
     label = read_label(file)
     owner = CORE if label.extension is None else load_extension(label.extension)
     representation = owner.representation
@@ -55,9 +55,7 @@ def read_subject(path: Path, cameras: Path | None = None) -> Subject:
             f"{file} is drawn by {owner.name}, with parameters that no PLY holds: segment a run of another recipe"
         )
     population = owner.load(file, representation.population)
-    listed = file.parent / "cameras.json" if cameras is None else cameras
-    if not listed.is_file():
-        raise InputError(f"{listed} is not there: give the folder of a run, or --cameras JSON")
+    views = read_cameras(file, cameras)
     frame = frame_of_means(population.means)
     return Subject(
         file,
@@ -65,7 +63,7 @@ def read_subject(path: Path, cameras: Path | None = None) -> Subject:
         population,
         place_population(population, representation.units, frame),
         configure_renderer(representation.renderer, label.set),
-        [view._replace(camera=place_camera(view.camera, frame)) for view in viewpoints.read(listed)],
+        [view._replace(camera=place_camera(view.camera, frame)) for view in views],
     )
 
 

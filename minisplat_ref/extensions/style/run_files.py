@@ -17,13 +17,11 @@ from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.frames import frame_from_json, place_population, place_scene, return_population
 from minisplat_ref.io.json_file import read_json
 from minisplat_ref.io.label import NO_LABEL
+from minisplat_ref.io.run_files import CAMERAS, CONFIG, METRICS, POINT_CLOUD, SHARED
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.training.representation import WORLD_UNITS
 from minisplat_ref.types import Gaussians, Scene
 
-CONFIG, PLY, SHARED, CAMERAS, METRICS = (
-    *("config.json", "point_cloud.ply", "shared.npz", "cameras.json", "metrics.json"),
-)
 OTHER = "give the --out folder of a training that has ended"
 
 
@@ -51,8 +49,8 @@ def open_run(folder: Path, scene: Path | None = None) -> OpenRun:
     InputError
         There is no run, it has not ended, its photographs are not there, or it trains something else or more.
     """
-    if not (folder / CONFIG).is_file() or not (folder / PLY).is_file():
-        missing = CONFIG if not (folder / CONFIG).is_file() else PLY
+    if not (folder / CONFIG).is_file() or not (folder / POINT_CLOUD).is_file():
+        missing = CONFIG if not (folder / CONFIG).is_file() else POINT_CLOUD
         raise InputError(f"{folder} has no {missing}: {OTHER}")
     config = read_json(folder / CONFIG, OTHER)
     try:
@@ -76,7 +74,7 @@ def open_run(folder: Path, scene: Path | None = None) -> OpenRun:
         raise InputError(f"{folder / CONFIG} has a frame without an origin of three numbers and a unit above 0")
     if not path.exists():
         raise InputError(f"{path}, the scene of {folder}, is not there: --scene PATH says where it is now")
-    gaussians = load_ply(folder / PLY)
+    gaussians = load_ply(folder / POINT_CLOUD)
     if len(gaussians.means) == 0:
         raise InputError(f"{folder} holds no Gaussians: {OTHER}")
     photographs = place_scene(load_scene(path, **reading), frame)
@@ -98,7 +96,7 @@ def write_run(folder: Path, run: OpenRun, gaussians: Gaussians, about: Mapping[s
         How it was styled, for ``config.json``.
     """
     files = return_population(gaussians, WORLD_UNITS, run.scene.frame)
-    save_ply(folder / PLY, files, NO_LABEL)
+    save_ply(folder / POINT_CLOUD, files, NO_LABEL)
     _write_json(folder / CONFIG, {**run.config, "styled": dict(about)})
     if (run.folder / CAMERAS).exists():
         shutil.copyfile(run.folder / CAMERAS, folder / CAMERAS)

@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.checkpoint import load_checkpoint
     from minisplat_ref.io.frames import place_camera, return_fields
     from minisplat_ref.io.ply import read_label, save_ply
+    from minisplat_ref.io.run_files import CAMERAS, POINT_CLOUD
     from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
     from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
     from minisplat_ref.training.schedule import alternatives_of
@@ -46,11 +47,11 @@ def run(args: argparse.Namespace) -> int:
     recipe, _ = written_by(metadata)
     if recipe != VDGS.name:
         raise InputError(f"{folder} was trained by recipe {recipe}, without a network: train with --recipe {VDGS.name}")
-    cameras = {view.name: view.camera for view in viewpoints.read(folder / "cameras.json")}
+    cameras = {view.name: view.camera for view in viewpoints.read(folder / CAMERAS)}
     if args.view not in cameras:
         raise InputError(f"{folder} has no view {args.view}: choose from {', '.join(sorted(cameras))}")
     bundles, frame = read_bundles(checkpoint, arrays, Gaussians), read_frame(checkpoint, metadata)
-    chosen = dict(setting.split("=", 1) for setting in read_label(folder / "point_cloud.ply").set)
+    chosen = dict(setting.split("=", 1) for setting in read_label(folder / POINT_CLOUD).set)
     modulation = alternatives_of(opacity_times)[chosen.get("modulation", opacity_times.__name__)]
     model = Model(bundles.gaussians, bundles.shared)
     seen, _ = as_seen(model, place_camera(cameras[args.view], frame), modulation(), IN_NUMPY)

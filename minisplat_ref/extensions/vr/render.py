@@ -41,11 +41,12 @@ def run(args: argparse.Namespace) -> int:
     """
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
     from minisplat_ref.extensions.vr.method import BUFFER
-    from minisplat_ref.io import load_ply, viewpoints, write_image
+    from minisplat_ref.io import load_ply, write_image
     from minisplat_ref.io.atomic import making_folder
     from minisplat_ref.io.label import warn_of_another
     from minisplat_ref.io.names import file_names
     from minisplat_ref.io.ply import read_label
+    from minisplat_ref.io.run_files import read_cameras
     from minisplat_ref.rendering import Request
     from minisplat_ref.reporting import markdown_table
     from minisplat_ref.studies.kit import with_progress
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     look = Gaze(x, y, args.full)
     model = Model(load_ply(args.ply))
     warn_of_another(args.ply, read_label(args.ply), "vr", "vr render")
-    views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
+    views = read_cameras(args.ply, args.cameras)
     views = [view for view in views if view.split == "test"] or views
     for view in views:
         check_gaze(look, view.camera, view.name)

@@ -19,10 +19,11 @@ from minisplat_ref.extensions.wave.kernels import sum_spectra
 from minisplat_ref.extensions.wave.placement import place, steepest_slope
 from minisplat_ref.extensions.wave.reference import Complexes
 from minisplat_ref.extensions.wave.sampling import Grid, check_sampling, field_from, grid_waves
-from minisplat_ref.io import viewpoints, write_image
+from minisplat_ref.io import write_image
 from minisplat_ref.io.frames import frame_of_means, place_camera, place_population
 from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.ply import load_ply, read_label
+from minisplat_ref.io.run_files import CAMERAS, model_file, read_cameras
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.progress import with_progress
 from minisplat_ref.training.representation import WORLD_UNITS
@@ -104,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     """
     if len(args.wavelengths) != 3:
         raise InputError(f"--wavelengths has {len(args.wavelengths)}: give three in nm, of red, green and blue light")
-    file = args.model / "point_cloud.ply" if args.model.is_dir() else args.model
+    file = model_file(args.model)
     gaussians, label = load_ply(file), read_label(file)
     if label.extension != "surfels":  # which are flat as they are
         warn_of_another(file, label, "wave", "wave hologram")
@@ -176,14 +177,12 @@ def _choose_camera(args: argparse.Namespace, file: Path) -> Viewpoint:
     InputError
         There are no cameras, or none of that name.
     """
-    path = args.cameras or file.parent / "cameras.json"
-    if args.cameras is None and not path.exists():
-        raise InputError(f"{file} has no cameras.json beside it: give --cameras JSON")
-    known = viewpoints.read(path)
+    known = read_cameras(file, args.cameras)
     if args.camera is None:
         return next((view for view in known if view.split == "test"), known[0])
     found = [view for view in known if view.name == args.camera]
     if not found:
         names = ", ".join(view.name for view in known[:5])
+        path = args.cameras or file.parent / CAMERAS
         raise InputError(f"{path} has no camera {args.camera!r}: choose from {names}{', ...' * (len(known) > 5)}")
     return found[0]

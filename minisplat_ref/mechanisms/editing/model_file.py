@@ -6,6 +6,7 @@ from pathlib import Path
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import further_properties, load_ply, read_label
+from minisplat_ref.io.run_files import model_file
 from minisplat_ref.types import Gaussians
 
 
@@ -22,7 +23,7 @@ def load_model(path: Path) -> Gaussians:
     InputError
         There is no PLY of Gaussians.
     """
-    file = _file(path)
+    file = model_file(path)
     gaussians: Gaussians = load_ply(file)
     further = further_properties(file)
     if further:
@@ -41,10 +42,6 @@ def load_label(path: Path) -> Label:
     InputError
         The label cannot be read.
     """
-    file = _file(path)
+    file = model_file(path)
     label = read_label(file)
     return label._replace(extension=None) if further_properties(file) else label
-
-
-def _file(path: Path) -> Path:
-    return path / "point_cloud.ply" if path.is_dir() else path

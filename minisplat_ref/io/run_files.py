@@ -1,0 +1,35 @@
+"""Files of a run that relatives read, too: their names, and where a command finds them that takes a run or a PLY.
+
+Whoever needs a run with its recipe and its photographs is the application, and opens it by :mod:`minisplat_ref.runs`.
+"""
+
+from pathlib import Path
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io import viewpoints
+from minisplat_ref.io.viewpoints import Viewpoint
+
+CONFIG = "config.json"
+POINT_CLOUD = "point_cloud.ply"
+SHARED = "shared.npz"
+CAMERAS = "cameras.json"
+METRICS = "metrics.json"
+
+
+def model_file(path: Path) -> Path:
+    """Return the PLY of a run if ``path`` is a folder, else ``path``."""
+    return path / POINT_CLOUD if path.is_dir() else path
+
+
+def read_cameras(file: Path, given: Path | None = None) -> list[Viewpoint]:
+    """Read the cameras beside a PLY, or those of the file that was given.
+
+    Raises
+    ------
+    InputError
+        There are none, or the file is not what it should be.
+    """
+    beside = file.parent / CAMERAS
+    if given is None and not beside.is_file():
+        raise InputError(f"{file} has no {CAMERAS} beside it: give --cameras JSON")
+    return viewpoints.read(given or beside)

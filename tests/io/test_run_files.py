@@ -1,0 +1,31 @@
+"""A run or a PLY, and the cameras beside it."""
+
+import json
+
+import pytest
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.run_files import CAMERAS, POINT_CLOUD, model_file, read_cameras
+
+CAMERA = {"img_name": "a", "width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "position": [0, 0, 0]}
+CAMERA |= {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+
+
+def test_a_run_and_a_file(tmp_path):
+    assert model_file(tmp_path) == tmp_path / POINT_CLOUD == tmp_path / "point_cloud.ply"
+    assert model_file(tmp_path / "a.ply") == tmp_path / "a.ply"
+
+
+def test_cameras_are_those_beside_or_those_given(tmp_path):
+    (tmp_path / CAMERAS).write_text(json.dumps([CAMERA]))
+    given = tmp_path / "other.json"
+    given.write_text(json.dumps([CAMERA | {"img_name": "b"}]))
+    names = [read_cameras(tmp_path / "a.ply", path)[0].name for path in (None, given)]
+    assert names == ["a", "b"] and CAMERAS == "cameras.json"
+
+
+def test_no_cameras_is_one_line(tmp_path):
+    with pytest.raises(InputError, match=r"a\.ply has no cameras\.json beside it: give --cameras JSON"):
+        read_cameras(tmp_path / "a.ply")
+    with pytest.raises(InputError, match=r"absent\.json: cannot be read"):
+        read_cameras(tmp_path / "a.ply", tmp_path / "absent.json")
