@@ -9,11 +9,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.viewpoints import Viewpoint
 
-CONFIG = "config.json"
-POINT_CLOUD = "point_cloud.ply"
-SHARED = "shared.npz"
-CAMERAS = "cameras.json"
-METRICS = "metrics.json"
+CONFIG = "config.json"  # everything needed to run it again
+POINT_CLOUD = "point_cloud.ply"  # the Gaussians
+SHARED = "shared.npz"  # parameters that belong to no Gaussian, if there are any
+CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
+METRICS = "metrics.json"  # what was measured on the test views
 
 
 def model_file(path: Path) -> Path:

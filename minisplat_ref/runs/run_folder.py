@@ -12,18 +12,16 @@ from minisplat_ref.io import run_files
 from minisplat_ref.io.atomic import is_part, remove_parts, replacing
 from minisplat_ref.io.json_file import read_json
 
-CONFIG = run_files.CONFIG  # everything needed to run it again
-POINT_CLOUD = run_files.POINT_CLOUD  # the Gaussians
-SHARED = run_files.SHARED  # parameters that belong to no Gaussian, if there are any
-METRICS = run_files.METRICS  # what was measured on the test views
+CONFIG = run_files.CONFIG
+POINT_CLOUD = run_files.POINT_CLOUD
+SHARED = run_files.SHARED
+CAMERAS = run_files.CAMERAS
+METRICS = run_files.METRICS
 LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
 EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
-CAMERAS = (
-    run_files.CAMERAS
-)  # cameras of all views and hashes of their photographs: to render without them, to know them
 DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
 REPORT = "report.html"  # all of it to look at
 BLOCK_PLAN = "plan.png"  # the blocks seen from above
