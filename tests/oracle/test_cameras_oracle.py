@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.mechanisms.cameras.gsplat_call import STEPS
 from minisplat_ref.mechanisms.cameras.oracle.call import CALL, STAGES
 from minisplat_ref.mechanisms.cameras.oracle.hard_cases import CASES, run_cases, select
 from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED
-from minisplat_ref.mechanisms.cameras.oracle.profiles import has_all_points
+from minisplat_ref.mechanisms.cameras.oracle.profiles import gsplat_1_5, has_all_points
 from minisplat_ref.oracle import call_comparison
 from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
 from minisplat_ref.types import Camera, Primitives
@@ -68,11 +70,25 @@ def test_gsplat_1_5_drops_a_gaussian_with_a_sigma_point_outside_of_the_margin():
         (0.0, 0.45, 1.0),  # y = 85, within 86.7: the margin ends at 88
         (0.0, 0.475, 1.0),  # y = 87.5, and one of its points at 89.2
         (0.0, 0.0, -1.0),  # behind
+        (-0.53, 0.0, 1.0),  # x = -3: outside of the image, inside of the margin
     ]
     n = len(means)
     quats = np.tile([1.0, 0, 0, 0], (n, 1))
     primitives = Primitives(np.array(means), quats, np.full((n, 3), 0.1), np.full(n, 0.5))
-    assert has_all_points(primitives, camera).tolist() == [True, False, False, True, False, False]
+    assert has_all_points(primitives, camera).tolist() == [True, False, False, True, False, False, True]
+
+
+def test_gsplat_1_5_draws_whole_tiles_within_the_bounds():
+    """By hand: a dot of 1 px at (56, 40), with its bounds, lies in the tile from 48 to 64 and from 32 to 48."""
+    camera = Camera(np.eye(3), np.zeros(3), 100.0, 100.0, 56.0, 40.0, 100, 80)
+    dot = Primitives(np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), 0.01), np.full(1, 0.5))
+    ours, theirs = STEPS.project(dot, camera, GSPLAT_MAIN), gsplat_1_5(STEPS).project(dot, camera, GSPLAT_MAIN)
+    assert (ours.boxes[0, :2] > (48, 32)).all() and (ours.boxes[0, 2:] < (64, 48)).all()
+    assert theirs.boxes.tolist() == [[48, 32, 64, 48]] and theirs.radii.tolist() == ours.radii.tolist()
+    at_the_edge = dot._replace(means=np.array([[0.43, 0.0, 1.0]]))  # x = 99 px: the last tile ends at the image's edge
+    assert gsplat_1_5(STEPS).project(at_the_edge, camera, GSPLAT_MAIN).boxes.tolist() == [[80, 32, 100, 48]]
+    outside = dot._replace(means=np.array([[0.55, 0.0, 1.0]]))  # 111 px
+    assert gsplat_1_5(STEPS).project(outside, camera, GSPLAT_MAIN).radii.tolist() == [[0, 0]]
 
 
 def test_the_rules_of_gsplat_1_5_are_told_from_ours(known):
