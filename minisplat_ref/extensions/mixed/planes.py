@@ -64,8 +64,9 @@ class _Steps(NamedTuple):
     J: Floats  # [N, 2, 3]
     A: Floats  # [N, 2, 3]
     R: Floats  # [N, 3, 3]
-    D: Floats  # [N, 3, 3] K in the primitive's frame
+    RD: Floats  # [N, 3, 3] R D with the covariance D in the primitive's own frame
     K: Floats  # [N, 3, 3]
+    AK: Floats  # [N, 2, 3]
     inverse: Floats  # [N, 2, 2] of B
     h: Floats  # [N, 2] world units per pixel
     focal: Floats  # [2] px
@@ -80,13 +81,15 @@ def _steps(hulls: Hulls, camera: Camera, conventions: Conventions) -> _Steps:
     ab = in_plane(hulls.vertices, hulls.n_vertices)  # [N, 3, 2]
     D = np.eye(3) * (scales * scales)[:, None]
     D[:, :2, :2] += KAPPA[hulls.n_vertices, None, None] * np.einsum("nki,nkj->nij", ab, ab)
-    K, A = R @ D @ np.swapaxes(R, 1, 2), J @ R_c
-    B = A @ K @ np.swapaxes(A, 1, 2) + conventions.eps2d * np.eye(2)
+    RD, A = R @ D, J @ R_c
+    K = RD @ np.swapaxes(R, 1, 2)
+    AK = A @ K
+    B = AK @ np.swapaxes(A, 1, 2) + conventions.eps2d * np.eye(2)
     inverse = adjugates(B) / determinants(B)[:, None, None]
-    h = np.einsum("nij,njk,nkl,l->ni", inverse, A, K, R_c[2])
+    h = np.einsum("nij,nj->ni", inverse, AK @ R_c[2])
     focal, s = np.array([camera.fx, camera.fy]), -h / x[:, 2:]
     m = np.column_stack([focal * s, 1 - np.sum(focal * s * x[:, :2], axis=1) / x[:, 2]])
-    return _Steps(x, J, A, R, D, K, inverse, h, focal, m)
+    return _Steps(x, J, A, R, RD, K, AK, inverse, h, focal, m)
 
 
 def _seen(hulls: Hulls, rows: np.ndarray) -> Hulls:
@@ -122,7 +125,7 @@ def planes_vjp(
         v_R_c = sum J^T v_A + v_y mu^T, and v_e on its third row
     """
     seen, eye = _seen(hulls, rows), with_principal_point(camera, conventions)
-    x, J, A, R, D, K, inverse, h, focal, m = _steps(seen, eye, conventions)
+    x, J, A, R, RD, K, AK, inverse, h, focal, m = _steps(seen, eye, conventions)
     means, quats, scales, _ = seen.primitives
     R_c, _ = pose(eye, means.dtype)
     z, u = x[:, 2:], x[:, :2] / x[:, 2:]
@@ -134,19 +137,18 @@ def planes_vjp(
     v_u = focal * h / z * v_m[:, 2:]
     v_c = np.einsum("nij,nj->ni", inverse, -v_s / z)
     v_B = -v_c[:, :, None] * h[:, None]
-    Ke = K @ R_c[2]
-    v_A = (v_B + np.swapaxes(v_B, 1, 2)) @ A @ K + v_c[:, :, None] * Ke[:, None]
+    v_A = (v_B + np.swapaxes(v_B, 1, 2)) @ AK + v_c[:, :, None] * (K @ R_c[2])[:, None]
     A_v_c = np.einsum("nij,ni->nj", A, v_c)
     v_K = np.swapaxes(A, 1, 2) @ v_B @ A + A_v_c[:, :, None] * R_c[2]
     v_x = pinhole_jacobians_vjp(x, eye, *slope_limits(eye, conventions, means.dtype), v_A @ R_c.T)
     v_x[:, :2] += v_u / z
-    v_x[:, 2:] += (np.sum(h * v_s, axis=1, keepdims=True) - v_w) / z**2 - np.sum(v_u * u, axis=1, keepdims=True) / z
-    v_R = (v_K + np.swapaxes(v_K, 1, 2)) @ R @ D
+    v_x[:, 2] += np.sum(h * v_s / z**2 - v_u * u / z, axis=1) - v_w[:, 0] / z[:, 0] ** 2
+    v_R = (v_K + np.swapaxes(v_K, 1, 2)) @ RD
     v_D = np.swapaxes(R, 1, 2) @ v_K @ R
     of_plane = KAPPA[seen.n_vertices, None, None] * (v_D + np.swapaxes(v_D, 1, 2))[:, :2, :2]
     v_ab = np.einsum("nij,nkj->nki", of_plane, in_plane(seen.vertices, seen.n_vertices))
     v_R_c = np.einsum("nki,nkj->ij", J, v_A) + v_x.T @ means
-    v_R_c[2] += np.einsum("nij,nj->i", K, A_v_c)
+    v_R_c[2] += np.sum(np.einsum("nij,nj->ni", K, A_v_c), axis=0)
     found = PlaneGradient(
         np.zeros_like(hulls.vertices), *(np.zeros_like(f) for f in hulls.primitives[:3]), v_R_c, v_x.sum(axis=0)
     )

@@ -1,10 +1,10 @@
 """How ellipses, lines and triangles are rendered: their colours alone, or with depths, normals and spreads.
 
-Colours alone are those of :mod:`.response`, and with one vertex each 3DGS renders them. Whoever wants more gets the same
-colours with the planes of :mod:`.planes`, by :mod:`.surfaces`. The channels are those of surfels, so that the losses of
-:mod:`minisplat_ref.mechanisms.surfels.losses` and meshes take them as they are: ``depth``, ``sum w z`` with the depths
-at the pixels; ``normal``, ``sum w n``; ``spread``, ``sum w q`` and ``sum w q^2`` of inverse depths. Left out is the
-channel ``median``: the median depth has no gradient here.
+Colours alone are those of :mod:`.response`, and with one vertex each 3DGS renders them. With further channels the
+colours are the same, and depths and normals come from the planes of :mod:`.planes`, by :mod:`.surfaces`. The channels
+are those of surfels, so that the losses of :mod:`minisplat_ref.mechanisms.surfels.losses` and meshes take them as they
+are: ``depth``, ``sum w z`` with the depths at the pixels; ``normal``, ``sum w n``; ``spread``, ``sum w q`` and
+``sum w q^2`` of inverse depths. Left out is the channel ``median``: the median depth has no gradient here.
 """
 
 import functools
@@ -86,9 +86,7 @@ def _surfaces_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradien
     v_vertices, v_planes, v_normals = v
     flat = _footprints_vjp(projected, (v_vertices,))
     rows = np.flatnonzero(v_planes.any(axis=1) | v_normals.any(axis=1))  # only what is seen has derivatives
-    through = planes_vjp(
-        _hulls(projected), rows, projected.camera, projected.conventions, Planes(v_planes, v_normals)
-    )
+    through = planes_vjp(_hulls(projected), rows, projected.camera, projected.conventions, Planes(v_planes, v_normals))
     return PayloadGradient(
         {**flat.fields, "vertices": flat.fields["vertices"] + through.vertices},
         flat.means + through.means,
@@ -147,7 +145,9 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
     """
     slices, payload = channels(request.wants), FLAT_COLORS
     if request.wants & DEPTHS:
-        payload = with_surfaces(Layout(*(slices[name].start if name in slices else None for name in ("depth", "spread"))))
+        payload = with_surfaces(
+            Layout(*(slices[name].start if name in slices else None for name in ("depth", "spread")))
+        )
     return render_payload(payload, model, view, request)
 
 

@@ -44,4 +44,9 @@ def _sides(tile: TileHits, colors: Floats) -> tuple[Bools | Ints, ...]:
     is_hit, found = tile.alphas > 0, place.hull.place.nearest
     vertex = np.argmax(found.weights, axis=2)
     is_vertex = (found.edges != INSIDE) & (found.weights.max(axis=2) == 1)
-    return is_hit, tile.is_clamped, place.is_bounded, np.where(is_hit, np.where(is_vertex, N_EDGES + vertex, found.edges), -2)
+    return (
+        is_hit,
+        tile.is_clamped,
+        place.is_bounded,
+        np.where(is_hit, np.where(is_vertex, N_EDGES + vertex, found.edges), -2),
+    )

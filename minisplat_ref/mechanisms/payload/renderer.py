@@ -113,9 +113,7 @@ def carry_depths(footprints: Any, wants: frozenset[str]) -> Floats:
     return depths if "depth" in wants else depths[:, :0]
 
 
-def carry_depths_vjp(
-    footprints: Any, wants: frozenset[str], v_carried: Floats
-) -> tuple[Floats, tuple[Floats, ...]]:
+def carry_depths_vjp(footprints: Any, wants: frozenset[str], v_carried: Floats) -> tuple[Floats, tuple[Floats, ...]]:
     """Gradient of :func:`carry_depths` with respect to the depths [N], and to nothing else."""
     depths: Floats = footprints.projection.depths
     return np.ascontiguousarray(v_carried[:, 0]) if "depth" in wants else np.zeros_like(depths), ()
@@ -211,7 +209,9 @@ def render_payload(payload: Payload, model: Model, view: View, request: Request)
     return output, PayloadTape(payload, projected, request.wants, sh_degree, blended, output)
 
 
-def render_payload_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+def render_payload_vjp(
+    tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None
+) -> RenderGradient:
     """Gradient of :func:`render_payload`, the sum of those through the projection, the colours and the payload."""
     if isinstance(tape, RenderTape):
         return SPLATTING.render_vjp(tape, v_image, v_alpha)

@@ -34,7 +34,10 @@ PLANE_MAX = 1e12  # largest entry of T^-1: discs seen more edge-on than that are
 
 @functools.cache
 def depth_shades(layout: tuple[int, int]) -> tuple[Callable, Callable]:
-    """Return ``shade`` and ``shade_vjp`` for channels of a layout, -1 without; the depth begins a place, q_0 ends it."""
+    """Return ``shade`` and ``shade_vjp`` for the channels of a layout, -1 where there is none.
+
+    A place begins with the depth and ends with q_0.
+    """
     depth_channel, q_channel = layout
 
     @scalar
