@@ -190,6 +190,29 @@ def test_colours_are_the_same_with_depths_and_without(backend, rng):
         assert_allclose(more.image[..., :3], alone.image, atol=PARITY_FLOAT64)
 
 
+def test_depths_and_normals_of_one_triangle_in_an_image(backend):
+    """Without the low-pass each pixel shows the plane: w z, w n, w (1/z - q_0) and its square, w the opacity 0.9."""
+    camera = turned_camera()
+    one = as_ellipses(balls(in_front_of(camera, [0.4, -0.3, 4.0]), [0.3], [0.9]))
+    one.log_scales[0, 2] = np.log(1e-9)
+    one = one._replace(
+        quats=np.array([[0.9, 0.3, -0.5, 0.1]]), vertices=np.array([[1.0, 0.3, -0.2, 0.8]]), n_vertices=np.full(1, 3.0)
+    )
+    request = Request(backend=backend, conventions=SHARP, wants=WANTS)
+    output, slices = RENDERER.render(Model(one), view_from(camera), request)[0], RENDERER.channels(WANTS)
+    axis = camera.cam_from_world_R @ rotation_matrices(one.quats)[0, :, 2]
+    x = np.array([0.4, -0.3, 4.0])
+    ys, xs = np.nonzero(np.isclose(output.alpha, 0.9, rtol=CLOSED_FORM))  # inside
+    z = axis @ x / (pinhole_rays(xs + 0.5, ys + 0.5, camera) @ axis)
+    assert len(z) > 10 and np.ptp(z) > 0.3
+    shown = output.image[ys, xs] / 0.9
+    assert_allclose(shown[:, slices["depth"]][:, 0], z, rtol=1e4 * CLOSED_FORM)
+    assert_allclose(shown[:, slices["normal"]], np.tile(-axis * np.sign(axis @ x), (len(z), 1)), atol=1e4 * CLOSED_FORM)
+    q, squares = shown[:, slices["spread"]].T
+    assert_allclose(squares, q * q, rtol=1e4 * CLOSED_FORM, atol=1e4 * CLOSED_FORM)
+    assert_allclose(q - q[0], 1 / z - 1 / z[0], atol=1e4 * CLOSED_FORM)
+
+
 @pytest.mark.parametrize(("dtype", "rel"), [(np.float64, PARITY_FLOAT64), (np.float32, 10 * PARITY_FLOAT32_IMAGE)])
 def test_kernels_and_reference_agree_in_all_channels(dtype, rel, rng):
     population, view = of_all_kinds(make_gaussians(rng, 40), rng), view_from(make_camera(rng=rng))
