@@ -13,7 +13,7 @@ its points in the world and h the prediction's slope::
 kappa is the variance of a uniform segment or triangle, and p the projected mean. On a plane 1/z is linear in the image,
 so a flat primitive that is large against a pixel has the depth of its own plane exactly. Seen from its edge, or smaller
 than the low-pass eps, its plane turns towards the camera instead of running to infinity: what 2D Gaussian Splatting
-does by taking the depth of the centre. A ball faces the camera. Rounding aside, a depth differs from that of the mean
+does by taking the depth of the centre. A large ball faces the camera. Rounding aside, a depth differs from that of the mean
 by no more deviations of depth than the pixel does of the ellipse.
 """
 
@@ -117,7 +117,7 @@ def planes_vjp(
     With the derivatives v_w of ``1 / z_p``, v_s and v_n, and ``y = R_c mu + t``::
 
         v_m = -(v_n - n (n . v_n)) / |m|,   v_s_k += f_k (v_m_k - u_k v_m_z),   v_u_k = -s_k f_k v_m_z
-        v_y = v_u / z on x and y,   v_z = (h . v_s - v_w) / z^2 - v_u . u / z,   v_h = -v_s / z
+        v_y = J's share, + v_u / z on x and y, + (h . v_s - v_w) / z^2 - v_u . u / z on z,   v_h = -v_s / z
         v_c = B^-1 v_h,   v_B = -v_c h^T,   v_A = (v_B + v_B^T) A K + v_c (K e)^T
         v_K = A^T v_B A + A^T v_c e^T,   v_e = K A^T v_c,   v_J = v_A R_c^T
         v_R = (v_K + v_K^T) R D,   v_D = R^T v_K R,   v_s_i = 2 s_i v_D_ii
@@ -150,7 +150,12 @@ def planes_vjp(
     v_R_c = np.einsum("nki,nkj->ij", J, v_A) + v_x.T @ means
     v_R_c[2] += np.sum(np.einsum("nij,nj->ni", K, A_v_c), axis=0)
     found = PlaneGradient(
-        np.zeros_like(hulls.vertices), *(np.zeros_like(f) for f in hulls.primitives[:3]), v_R_c, v_x.sum(axis=0)
+        vertices=np.zeros_like(hulls.vertices),
+        means=np.zeros_like(hulls.primitives.means),
+        quats=np.zeros_like(hulls.primitives.quats),
+        scales=np.zeros_like(hulls.primitives.scales),
+        cam_from_world_R=v_R_c,
+        cam_from_world_t=v_x.sum(axis=0),
     )
     found.vertices[rows] = in_plane_vjp(seen.n_vertices, v_ab)
     found.means[rows], found.quats[rows] = v_x @ R_c, rotation_matrices_vjp(quats, v_R)

@@ -76,9 +76,8 @@ def _surfaces(projected: Projected) -> SurfaceFootprints:
     rows = np.flatnonzero(seen.projection.radii[:, 0] > 0)
     found = planes_of(_hulls(projected), rows, camera, projected.conventions)
     pivot = choose_pivot(seen.projection.depths[rows])
-    return SurfaceFootprints(
-        *(seen.projection, seen.vertices, seen.n_vertices), *(field.astype(dtype) for field in found), pivot
-    )
+    planes, normals = found.planes.astype(dtype), found.normals.astype(dtype)
+    return SurfaceFootprints(seen.projection, seen.vertices, seen.n_vertices, planes, normals, pivot)
 
 
 def _surfaces_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradient:
