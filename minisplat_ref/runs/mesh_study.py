@@ -28,7 +28,7 @@ from minisplat_ref.runs.meshing import Asked, Opened, mesh_run
 from minisplat_ref.runs.scoring import Trained
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_deviations, with_deviation
-from minisplat_ref.training.schedule import as_trained
+from minisplat_ref.training.schedule import Recipe, as_trained, configure_by_name
 from minisplat_ref.types import FILE_FRAME
 
 TAU = 0.05  # world units, metres of these scenes
@@ -42,18 +42,30 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train by every recipe with every seed, make meshes, and measure them."""
     made = make_scene(args.scene)
     truth = true_surface(made)
+    recipes = {text: _recipe_of(text, args.iterations) for text in args.recipes}
     settings = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations"), "tau": TAU}
     jobs = [{"recipe": name, "seed": seed} for seed in args.seeds for name in args.recipes]
 
     def measure(recipe: str, seed: int) -> Iterable[Mapping[str, Any]]:
-        return measure_meshes(train_run(made, recipe, args.iterations, seed), truth)
+        return measure_meshes(train_run(made, recipes[recipe], seed), truth)
 
     records = kit.resume(args.out, settings, jobs, measure)
     heading = ["recipe", "depth", "voxel", "accuracy", "completeness", "Chamfer", f"F ({TAU:g})", "normals (degrees)"]
     rows = to_rows(records, args.recipes)
     text = f"{kit.title(settings)}; {kit.seeds_of(args)}; lengths in thousandths of the scene's unit"
     result = {**settings, "seeds": list(args.seeds), "records": records}
-    return kit.Report(result, draw(records, args.recipes), f"{text}\n\n{markdown_table(heading, rows)}")
+    arms = kit.arms_of(records, "recipe", ("chamfer", "f_score"))
+    return kit.Report(result, draw(records, args.recipes), f"{text}\n\n{markdown_table(heading, rows)}", arms)
+
+
+def _recipe_of(text: str, iterations: int) -> Recipe:
+    """Return a recipe by its name, with settings if there are; one that decides on its length has its own."""
+
+    def find(name: str) -> Recipe:
+        recipe = find_recipe(name, iterations)
+        return recipe if recipe.cooling is None else get_recipe(name)
+
+    return configure_by_name(find, text)
 
 
 def true_surface(made: SyntheticScene) -> OrientedPoints:
@@ -70,11 +82,8 @@ def true_surface(made: SyntheticScene) -> OrientedPoints:
     return OrientedPoints(every[chosen], np.concatenate(directions)[chosen])
 
 
-def train_run(made: SyntheticScene, name: str, iterations: int, seed: int) -> Opened:
+def train_run(made: SyntheticScene, recipe: Recipe, seed: int) -> Opened:
     """Train, and return what ``mesh`` reads of the folder of a run."""
-    recipe = find_recipe(name, iterations)
-    if recipe.cooling is not None:
-        recipe = get_recipe(name)  # which decides its length
     state = kit.train_with_progress(made.scene, recipe, seed)
     renderer = as_trained(recipe, state.model).renderer
     trained = Trained(state.model, renderer, made.scene.background, GSPLAT_MAIN.name, "cpu")

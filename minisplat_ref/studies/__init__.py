@@ -194,7 +194,8 @@ MESH = declare(
         type=list_of(name),
         default=("3dgs-accel", "mini-splatting2", "adaptive", "surfels"),
         metavar="R,Q",
-        help="names as in train --recipe (default 3dgs-accel,mini-splatting2,adaptive,surfels)",
+        help="names as in train --recipe; R+NAME=VALUE changes a setting (default"
+        " 3dgs-accel,mini-splatting2,adaptive,surfels)",
     ),
     iterations(2000),
     SEEDS,

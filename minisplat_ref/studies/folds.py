@@ -34,7 +34,7 @@ from minisplat_ref.studies.adaptive import ITERATIONS, warm_up
 from minisplat_ref.studies.coverage import count_covering_views
 from minisplat_ref.studies.figures import standard_error
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, as_trained, configure, parse_settings
+from minisplat_ref.training.schedule import Recipe, as_trained, configure_by_name
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Bools, Floats, Ints, Scene, View, number_views
 
@@ -105,10 +105,11 @@ def recipe_of(text: str) -> Recipe:
 
     Recipes with a schedule have 3,000 iterations.
     """
-    name, *settings = text.split("+")
-    recipe = get_recipe(name) if get_recipe(name).cooling is not None else get_recipe(name, ITERATIONS)
-    pairs = dict(setting.partition("=")[::2] for setting in settings)
-    return configure(recipe, **parse_settings(recipe, pairs))
+
+    def find(name: str) -> Recipe:
+        return get_recipe(name) if get_recipe(name).cooling is not None else get_recipe(name, ITERATIONS)
+
+    return configure_by_name(find, text)
 
 
 def measure(fold: Fold, recipe: Recipe, seed: int) -> dict[str, Any]:

@@ -371,6 +371,20 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     return {name: _parse(name, text, known[name], name not in weights) for name, text in texts.items()}
 
 
+def configure_by_name(find: Callable[[str], Recipe], text: str) -> Recipe:
+    """Return a recipe that ``find`` knows by name, with settings if there are: ``adaptive+min_slope=0.5``.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe, it has no such setting, or the text is not a value of its type.
+    """
+    name, *settings = text.split("+")
+    recipe = find(name)
+    texts = dict(setting.partition("=")[::2] for setting in settings)
+    return configure(recipe, **parse_settings(recipe, texts))
+
+
 def _parse(name: str, text: str, present: Any, may_be_none: bool) -> Any:
     if callable(present):
         choices = alternatives_of(present)

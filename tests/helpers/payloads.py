@@ -38,6 +38,8 @@ class Case(NamedTuple):
     formula: tuple[str, Callable[..., Any]]
     """A function of the reference that returns gradients, and where its caller finds it."""
     not_learnt: frozenset[str] = frozenset()
+    has_own_depths: bool = False
+    """Whether depths are not those of 3DGS even without a payload."""
 
 
 def random_cuts(rng, gaussians, n_curves=1):
@@ -83,6 +85,7 @@ CASES = {
         mixed_stages,
         ("minisplat_ref.extensions.mixed.projection.in_plane_vjp", in_plane_vjp),
         frozenset({"n_vertices"}),
+        has_own_depths=True,
     ),
     "textured": Case(
         TEXTURED_GAUSSIANS,
@@ -95,14 +98,14 @@ CASES = {
 }
 
 
-def drawn(renderer, population, view, backend, compared_to=None):
+def drawn(renderer, population, view, backend, compared_to=None, with_depth=True):
     """Return an image, and its gradient with random weights.
 
     In float64 with the depth, as the oracle renders, so that both share the compiled kernels; without it if it is
     compared to an image in float32.
     """
     rng, dtype = np.random.default_rng(1), population.means.dtype
-    wants = frozenset({"depth"} if np.dtype(compared_to or dtype) == np.float64 else ())
+    wants = frozenset({"depth"} if with_depth and np.dtype(compared_to or dtype) == np.float64 else ())
     output, tape = renderer.render(Model(population), view, Request(BACKGROUND, backend=backend, wants=wants))
     v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
     return output, renderer.render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))

@@ -71,8 +71,9 @@ def agree(case, population, view, dtype, image_rel, gradient_rel):
 @OF_ALL
 def test_without_a_payload_they_are_3dgs_to_the_last_byte(case, backend, rng):
     gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
-    ours, v_ours = drawn(case.representation.renderer, case.plain(gaussians), view, backend)
-    theirs, v_theirs = drawn(SPLATTING, gaussians, view, backend)
+    with_depth = not case.has_own_depths
+    ours, v_ours = drawn(case.representation.renderer, case.plain(gaussians), view, backend, with_depth=with_depth)
+    theirs, v_theirs = drawn(SPLATTING, gaussians, view, backend, with_depth=with_depth)
     assert theirs.alpha.max() > COVERAGE_MIN and ours.image.tobytes() == theirs.image.tobytes()
     for name in Gaussians._fields:
         assert getattr(v_ours.gaussians, name).tobytes() == getattr(v_theirs.gaussians, name).tobytes(), name
@@ -81,8 +82,9 @@ def test_without_a_payload_they_are_3dgs_to_the_last_byte(case, backend, rng):
 @OF_ALL
 def test_payloads_that_change_nothing(case, backend, rng):
     gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
-    ours, _ = drawn(case.representation.renderer, case.harmless(gaussians), view, backend)
-    theirs, _ = drawn(SPLATTING, gaussians, view, backend)
+    with_depth = not case.has_own_depths
+    ours, _ = drawn(case.representation.renderer, case.harmless(gaussians), view, backend, with_depth=with_depth)
+    theirs, _ = drawn(SPLATTING, gaussians, view, backend, with_depth=with_depth)
     assert_allclose(ours.image, theirs.image, atol=PARITY_FLOAT64)
 
 

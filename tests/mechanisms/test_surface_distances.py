@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.meshes.distances import OrientedPoints, compare_surfaces, sample_surface
 
 
@@ -67,3 +68,23 @@ def test_the_study_measures_meshes(tmp_path, capsys, monkeypatch):
     ]
     assert all(0 < r["chamfer"] < 1 and 0 < r["f_score"] < 1 for r in records)
     assert (out / "figure.png").stat().st_size > 10_000 and "| 3dgs-accel | midpoint |" in capsys.readouterr().out
+
+
+def test_the_study_trains_recipes_with_settings_and_refuses_unknown_ones(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("skimage")
+    trained = []
+
+    def record(made, recipe, seed):
+        trained.append(recipe)
+        raise InputError("enough")
+
+    monkeypatch.setattr("minisplat_ref.runs.mesh_study.train_run", record)
+    options = ["--iterations", "150", "--seeds", "0"]
+    command = ["study", "mesh", "room", "--recipes", "3dgs-accel+dssim_weight=0.5", *options]
+    assert main([*command, "--out", str(tmp_path / "one")]) == 2 and "enough" in capsys.readouterr().err
+    assert trained[0].losses[0].function.keywords["dssim_weight"] == 0.5 and trained[0].iterations == 150
+    command = ["study", "mesh", "room", "--recipes", "3dgs-accel,surfels+distort=1", *options]
+    assert main([*command, "--out", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "surfels has no distort to set" in error and "\n" not in error and len(trained) == 1
+    assert not (tmp_path / "none" / "result.json").exists()

@@ -11,7 +11,17 @@ the level sets are the same. With one vertex it is 3DGS. Vertices lie in the pla
 near points of like colour (:mod:`minisplat_ref.extensions.mixed.population`); during it, hulls lose vertices that make
 no difference, and needles and discs get some (:mod:`minisplat_ref.extensions.mixed.kinds`).
 
-    minisplat-ref train SCENE --recipe mixed
+It reconstructs surfaces, so the recipe has the losses of 2D Gaussian Splatting at that paper's weights and dates
+(:mod:`minisplat_ref.mechanisms.surfels.losses`). A pixel's depth and normal come from the primitive's plane
+(:mod:`minisplat_ref.extensions.mixed.planes`), and ``mesh`` fuses the depths of all views:
+
+    normal_consistency   0.05, from iteration 7,000: planes face as the surface through the depths does
+    distortion           0, from 3,000: the hits of a ray lie at one depth
+
+    minisplat-ref train SCENE --recipe mixed --out runs/mixed
+    minisplat-ref train SCENE --recipe mixed --set distortion=100
+    minisplat-ref mesh runs/mixed --out mesh.ply
+    minisplat-ref study mesh room --recipes mixed,mixed+normal_consistency=0 --out DIR
     minisplat-ref study mixed/shapes --out DIR
     minisplat-ref study mixed/letter --out DIR
     minisplat-ref study mixed/scene SCENE room --iterations 300 --out DIR
@@ -20,10 +30,15 @@ no difference, and needles and discs get some (:mod:`minisplat_ref.extensions.mi
 :mod:`minisplat_ref.extensions.mixed.fit` fits an image with a few primitives of one kind. ``docs/FAMILY.md`` has the
 measured figures.
 
+Built of the paper: the three primitives and their response, groups of points at the start, the loss of vertices, the
+losses, meshes. Left out: the construction by tangents, which a test follows, and normals from median depths, since
+the median has no gradient here. The paper's own weights of the losses are not known to us: they are those of 2DGS.
+
 This deviates from the paper as follows. A hull is placed by the mean of its vertices, where the paper counts from the
 first; what makes a triangle a line is its altitude instead of Pearson's correlation, which depends on the axes; changes
-to more vertices are not the paper's. It trains by 3DGS's losses, not by those of surfels, and makes no mesh. A child of
-a split keeps its parent's vertices, as in the paper, and size limits look at deviations alone.
+to more vertices are not the paper's. Primitives are as thick as training makes them, where surfels are flat; so a depth
+is that of the best plane through a primitive, which for a flat one is its own. A child of a split keeps its parent's
+vertices, as in the paper, and size limits look at deviations alone.
 """
 
 from minisplat_ref.extensions.extension import Extension

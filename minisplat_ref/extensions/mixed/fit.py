@@ -12,6 +12,7 @@ import numpy as np
 
 from minisplat_ref.extensions.mixed.method import MIXED, MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
@@ -24,6 +25,7 @@ IMAGE = SIZE / FOCAL * DISTANCE  # its side, world units
 CAMERA = Camera(np.eye(3), np.zeros(3), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE)
 EXTENT = 10.0  # of the scene: so far primitives may move, in units of the rates of 3DGS
 SUPERSAMPLING = 8  # samples along each side of a pixel of a silhouette
+_RECIPE = MIXED._replace(events=(), losses=GS_ACCEL.losses, sh_degree=0, representation=MIXED_GAUSSIANS)
 NAMES = {1: "ellipses", 2: "lines", 3: "triangles"}
 N_FLOATS = {1: 14, 2: 16, 3: 18}  # of one without view-dependent colour: the second and third vertex have two each
 
@@ -79,7 +81,7 @@ def fit_primitives(target: Floats, n: int, *, n_vertices: int, iterations: int, 
     none = np.zeros((0, 3))
     scene = Scene("target", number_views([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
     population = scatter(n, n_vertices, rng)
-    recipe = scale_recipe(MIXED._replace(events=(), sh_degree=0, representation=MIXED_GAUSSIANS), iterations)
+    recipe = scale_recipe(_RECIPE, iterations)
     state = TrainState(population, zero_moments(population), step=0, view_order=[], rng=rng, stats={})
     fit: MixedGaussians = train(scene, recipe, seed=seed, state=state).gaussians
     return fit

@@ -3,6 +3,8 @@
 A record begins with the conic's, whose factors whiten: ``e = dx + slope dy`` and dy are, but for their lengths, the
 whitened coordinates. It continues with the vertices from the centre, and for each edge u with ``g = Q u / (u . Q u)``,
 so that the nearest point of a line through o along u is found by one product, ``f = -(o . g)``.
+
+Surfaces have the same records with their planes in them, and :mod:`.surfaces`' depth at every pixel.
 """
 
 import functools
@@ -23,19 +25,26 @@ from minisplat_ref.cpu.compositing.responses import (
     conic_response,
 )
 from minisplat_ref.extensions.mixed.response import FLAT, HullFootprints
+from minisplat_ref.extensions.mixed.surfaces import RATIO_MIN, SurfaceFootprints
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select
+from minisplat_ref.jit.lanes import broadcast, load, maximum, minimum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 from minisplat_ref.mechanisms.payload.footprints import boxes_of
+from minisplat_ref.mechanisms.surfels.kernels import channels_of, depth_shades
+from minisplat_ref.mechanisms.surfels.response import Layout
 from minisplat_ref.scalar.compositing import mahalanobis
 from minisplat_ref.types import Floats
 
 V_1, V_2, V_3 = range(CONIC_GRADIENTS, CONIC_GRADIENTS + 6, 2)  # vertices from the centre
 N_GRADIENTS = V_3 + 2
+# Of surfaces: w, the inverse depth of the mean, and s.
+INVERSE_DEPTH, TILT_X, TILT_Y = range(N_GRADIENTS, N_GRADIENTS + 3)
+N_SURFACE_GRADIENTS = TILT_Y + 1
 # ORIENTATION: sign of the triangle's area, 0 if it is flat
-DEPTH, COUNT, ORIENTATION = range(N_GRADIENTS, N_GRADIENTS + 3)
-G_12, G_23, G_31 = range(ORIENTATION + 1, ORIENTATION + 7, 2)
+DEPTH, COUNT, ORIENTATION, PIVOT = range(N_SURFACE_GRADIENTS, N_SURFACE_GRADIENTS + 4)
+G_12, G_23, G_31 = range(PIVOT + 1, PIVOT + 7, 2)
 N_COLUMNS = G_31 + 2
+_RATIO_MIN = np.float32(RATIO_MIN)
 
 
 @functools.cache
@@ -133,6 +142,49 @@ def hull_response(exp: Callable) -> KernelResponse:
     )
 
 
+@functools.cache
+def _surface_response(exp: Callable, layout: tuple[int, int]) -> KernelResponse:
+    """Response of hulls with a depth at every pixel."""
+    hull = hull_response(exp)
+    hull_hit, hull_hit_vjp = hull.hit, hull.hit_vjp
+
+    @scalar
+    def hit(records, n, x, y):
+        alpha, _, on_hull = hull_hit(records, n, x, y)
+        nothing = broadcast(records.dtype.type(0))
+        d_x, d_y = records[n, MEAN_X] - x, records[n, MEAN_Y] - y + nothing
+        r = ONE - (records[n, TILT_X] * d_x + records[n, TILT_Y] * d_y)
+        depth = ONE / (records[n, INVERSE_DEPTH] * maximum(r, _RATIO_MIN))
+        return alpha, depth, (depth, d_x, d_y, r, on_hull, records[n, PIVOT])
+
+    @scalar
+    def hit_vjp(records, n, place, v_mean, v_shape, v_place):
+        """With ``q = 1 / z = w r``: ``v_q = -z^2 v_z``; see :func:`.surfaces.hit_vjp`."""
+        depth, d_x, d_y, r, on_hull, _ = place
+        v = hull_hit_vjp(records, n, on_hull, v_mean, v_shape, v_place)
+        v_q = -depth * depth * load(v_place, 0)
+        v_r = select(r < _RATIO_MIN, ZERO, records[n, INVERSE_DEPTH] * v_q)
+        return (
+            v[0] - records[n, TILT_X] * v_r,
+            v[1] - records[n, TILT_Y] * v_r,
+            *v[2:],
+            maximum(r, _RATIO_MIN) * v_q,
+            -v_r * d_x,
+            -v_r * d_y,
+        )
+
+    return KernelResponse(
+        functools.partial(_surface_records, hull.records),
+        functools.partial(_surface_records_vjp, hull.records_vjp),
+        boxes_of,
+        hit,
+        hit_vjp,
+        N_SURFACE_GRADIENTS,
+        *depth_shades(layout),
+        n_places=1,
+    )
+
+
 @scalar
 def side(a, b):
     """On which side of the edge from a to b the origin lies: the cross product of both."""
@@ -142,6 +194,11 @@ def side(a, b):
 def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     return hull_response(choose_exponential(dtype))
+
+
+def surface_response_for(layout: Layout, dtype: np.dtype) -> KernelResponse:
+    """Return the response of surfaces with the channels of a layout."""
+    return _surface_response(choose_exponential(dtype), channels_of(layout))
 
 
 def _records(conic_records: Callable, footprints: HullFootprints, dtype: np.dtype) -> Floats:
@@ -168,3 +225,17 @@ def _records_vjp(conic_records_vjp: Callable, footprints: HullFootprints, v_reco
     """Gradient with respect to the footprints' ``FIELDS``."""
     v_vertices = v_records[:, V_1:N_GRADIENTS].reshape(-1, 3, 2).astype(footprints.vertices.dtype)
     return *conic_records_vjp(footprints.projection, v_records), v_vertices
+
+
+def _surface_records(hull_records: Callable, footprints: SurfaceFootprints, dtype: np.dtype) -> Floats:
+    records: Floats = hull_records(footprints, dtype)
+    records[:, INVERSE_DEPTH:N_SURFACE_GRADIENTS], records[:, PIVOT] = footprints.planes, footprints.pivot
+    return records
+
+
+def _surface_records_vjp(
+    hull_records_vjp: Callable, footprints: SurfaceFootprints, v_records: Floats
+) -> tuple[Floats, ...]:
+    """Gradient with respect to the footprints' ``FIELDS``."""
+    v_planes = v_records[:, INVERSE_DEPTH:N_SURFACE_GRADIENTS].astype(footprints.planes.dtype)
+    return *hull_records_vjp(footprints, v_records), v_planes

@@ -1,58 +1,20 @@
-"""How ellipses, lines and triangles are drawn, and the recipe that trains them."""
+"""How the population is trained: the recipe of 3DGS with the losses of 2D Gaussian Splatting, and changes of kind."""
 
 from functools import partial
 
 import numpy as np
 
-from minisplat_ref.extensions.mixed.kernels import response_for
 from minisplat_ref.extensions.mixed.kinds import promote_kinds, simplify_kinds
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, group_gaussians
-from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
-from minisplat_ref.extensions.mixed.response import RESPONSE, HullFootprints
+from minisplat_ref.extensions.mixed.renderer import MIXED_RENDERER
 from minisplat_ref.io.frames import Unit
-from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
+from minisplat_ref.mechanisms.surfels.losses import DISTORTION, NORMAL_CONSISTENCY
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import Every
 from minisplat_ref.training.state import Iteration, TrainState
-from minisplat_ref.types import Bools, Floats, Projection
-
-BOUNDLESS = np.array([1e-12, 0.0, 1e-12])  # px^-2: a million pixels
-
-
-def _is_plain(g: MixedGaussians) -> bool:
-    return bool(np.all(counts(g) == 1))
-
-
-def _hulls(projected: Projected) -> Hulls:
-    g: MixedGaussians = projected.gaussians
-    return Hulls(projected.primitives, g.vertices, counts(g))
-
-
-def _footprints(projected: Projected) -> HullFootprints:
-    return footprints_of(_hulls(projected), projected.projection, projected.camera, projected.conventions)
-
-
-def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradient:
-    """Gradient of :func:`_footprints` for that with respect to the vertices in the image."""
-    (v_vertices,) = v
-    found = footprints_vjp(_hulls(projected), projected.camera, projected.conventions, v_vertices)
-    fields = {"vertices": found.vertices, "n_vertices": np.zeros_like(projected.gaussians.n_vertices)}
-    v_scales = np.zeros_like(projected.primitives.scales)
-    return PayloadGradient(fields, found.means, found.quats, v_scales, found.cam_from_world_R, found.cam_from_world_t)
-
-
-def _list_boxes(footprints: HullFootprints) -> Projection:
-    """Return the projection with ellipses that reach all tiles under the boxes of lines and triangles."""
-    projection = footprints.projection
-    conics = np.where((footprints.n_vertices > 1)[:, None], BOUNDLESS, projection.conics)
-    return projection._replace(conics=conics)
-
-
-PAYLOAD = Payload(
-    "lines and triangles", RESPONSE, response_for, _is_plain, _footprints, _footprints_vjp, listed=_list_boxes
-)
+from minisplat_ref.types import Bools
 
 
 def simplify_hulls(state: TrainState, iteration: Iteration, *, least: float, min_height: float) -> str:
@@ -83,7 +45,7 @@ MIXED_GAUSSIANS = Representation(
     population=MixedGaussians,
     units={**WORLD_UNITS, "vertices": Unit.LENGTH},
     extend=group_gaussians,
-    renderer=payload_renderer("mixed", PAYLOAD),
+    renderer=MIXED_RENDERER,
     rates=Rates({"vertices": 2e-4, "n_vertices": 0.0}, frozenset({"vertices"})),
 )
 
@@ -91,10 +53,11 @@ _changing = partial(Every, 500, stop=15_000, min_gap=100)
 
 MIXED = GS_ACCEL._replace(
     name="mixed",
+    losses=(*GS_ACCEL.losses, NORMAL_CONSISTENCY, DISTORTION),
     events=(
         *GS_ACCEL.events,
         _changing(partial(simplify_hulls, least=0.5, min_height=0.5), start=1_000),
         _changing(partial(promote, ratio=6.0, size_fraction=0.01), start=1_000),
     ),
 )
-"""``mixed``: 3DGS with ellipses, lines and triangles."""
+"""``mixed``: 3DGS with ellipses, lines and triangles, and the losses of surfels."""

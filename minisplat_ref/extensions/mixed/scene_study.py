@@ -3,7 +3,7 @@
 Points of a scene become ellipses, lines and triangles by groups. 3DGS gets as many floats, by leaving points out at
 random; and, for comparison, all of the points, and one Gaussian for each group, which tells what vertices are worth
 apart from the choice of points. Nothing is densified or pruned, so that numbers stay; kinds change as the recipe has
-it.
+it. The loss is that of 3DGS for all.
 """
 
 import argparse
@@ -46,7 +46,9 @@ def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]
     """Return a row for each population of a scene."""
     names = {promote.__name__, simplify_hulls.__name__}
     mixed = RECIPE._replace(
-        representation=MIXED_GAUSSIANS, events=tuple(event for event in RECIPE.events if action_name(event) in names)
+        losses=GS_ACCEL.losses,
+        representation=MIXED_GAUSSIANS,
+        events=tuple(event for event in RECIPE.events if action_name(event) in names),
     )
     plain = GS_ACCEL._replace(events=())
     whole = initial_gaussians(scene, plain.sh_degree, np.random.default_rng(0))

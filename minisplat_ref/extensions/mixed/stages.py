@@ -1,4 +1,7 @@
-"""What the gradient proof checks: the renderer, with hulls of all kinds and the edges on which pixels' hits lie."""
+"""What the gradient proof checks: the renderer and all its channels, with hulls of all kinds.
+
+Recorded are the edges on which pixels' hits lie, and which depths are bounded.
+"""
 
 import numpy as np
 
@@ -6,6 +9,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
 from minisplat_ref.extensions.mixed.response import INSIDE
+from minisplat_ref.extensions.mixed.surfaces import SurfacePlace
 from minisplat_ref.mechanisms.payload.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
@@ -18,7 +22,8 @@ N_EDGES = 3
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return the renderer; what is hit, and where the nearest points of hulls lie, is found by the reference."""
-    return (renderer_stage(backend, setting, MIXED_GAUSSIANS._replace(extend=of_all_kinds), _sides, rng),)
+    of_all = MIXED_GAUSSIANS._replace(extend=of_all_kinds)
+    return (renderer_stage(backend, setting, of_all, _sides, rng, frozenset({"depth", "normal", "spread"})),)
 
 
 def of_all_kinds(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:
@@ -35,7 +40,13 @@ def _sides(tile: TileHits, colors: Floats) -> tuple[Bools | Ints, ...]:
 
     Squares of distances have no second derivative where the nearest point goes from an edge to a vertex.
     """
-    is_hit, found = tile.alphas > 0, tile.hit.place.nearest
+    place: SurfacePlace = tile.hit.place
+    is_hit, found = tile.alphas > 0, place.hull.place.nearest
     vertex = np.argmax(found.weights, axis=2)
     is_vertex = (found.edges != INSIDE) & (found.weights.max(axis=2) == 1)
-    return is_hit, tile.is_clamped, np.where(is_hit, np.where(is_vertex, N_EDGES + vertex, found.edges), -2)
+    return (
+        is_hit,
+        tile.is_clamped,
+        place.is_bounded,
+        np.where(is_hit, np.where(is_vertex, N_EDGES + vertex, found.edges), -2),
+    )

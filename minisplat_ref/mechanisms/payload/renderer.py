@@ -28,7 +28,6 @@ from minisplat_ref.rendering import (
     activate_vjp,
     choose_degree,
 )
-from minisplat_ref.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -43,7 +42,7 @@ from minisplat_ref.types import (
     View,
 )
 
-KNOWN = frozenset({"depth", "stats", "median_depth"})  # what can be wanted
+MEASURES = frozenset({"stats", "median_depth"})  # what can be wanted besides channels
 
 
 class Projected(NamedTuple):
@@ -108,6 +107,18 @@ def channels_alone_vjp(
     return v_coefficients, {}
 
 
+def carry_depths(footprints: Any, wants: frozenset[str]) -> Floats:
+    """Return the depths of the means [N, 1] if they are wanted, else [N, 0]."""
+    depths: Floats = footprints.projection.depths[:, None]
+    return depths if "depth" in wants else depths[:, :0]
+
+
+def carry_depths_vjp(footprints: Any, wants: frozenset[str], v_carried: Floats) -> tuple[Floats, tuple[Floats, ...]]:
+    """Gradient of :func:`carry_depths` with respect to the depths [N], and to nothing else."""
+    depths: Floats = footprints.projection.depths
+    return np.ascontiguousarray(v_carried[:, 0]) if "depth" in wants else np.zeros_like(depths), ()
+
+
 class Payload(NamedTuple):
     """The functions in which an extension describes its Gaussians."""
 
@@ -131,6 +142,13 @@ class Payload(NamedTuple):
     """Return its gradient with respect to the D channels, and with respect to fields of the population."""
     listed: Callable[[Any], Projection] = projection_alone
     """Return, of the footprints, by what tiles are listed: ellipses that hold all that is drawn, in their boxes."""
+    channels: Callable[[frozenset[str]], dict[str, slice]] = SPLATTING.channels
+    """Return the channels by name, as a renderer does."""
+    carry: Callable[[Any, frozenset[str]], Floats] = carry_depths
+    """Return the channels [N, K] after RGB that are the same in a whole footprint; 0 in those that ``shade`` adds."""
+    carry_vjp: Callable[[Any, frozenset[str], Floats], tuple[Floats, tuple[Floats, ...]]] = carry_depths_vjp
+    """Return its gradient with respect to the projection's depths [N], and to fields of the footprints, which
+    ``footprints_vjp`` gets after those of the response."""
 
 
 class PayloadTape(NamedTuple):
@@ -138,6 +156,7 @@ class PayloadTape(NamedTuple):
 
     payload: Payload
     projected: Projected
+    wants: frozenset[str]
     sh_degree: int | Ints  # active
     blended: tuple[Any, Floats, Floats, TileBins]  # footprints, coefficients, background, tile lists
     output: RenderOutput
@@ -145,10 +164,10 @@ class PayloadTape(NamedTuple):
 
 def payload_renderer(name: str, payload: Payload) -> Renderer:
     """Return the renderer of Gaussians with a payload."""
-    return Renderer(name, partial(_render, payload), _render_vjp, SPLATTING.channels)
+    return Renderer(name, partial(render_payload, payload), render_payload_vjp, payload.channels)
 
 
-def _render(payload: Payload, model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+def render_payload(payload: Payload, model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
     """Render the view; without a payload 3DGS renders it.
 
     Raises
@@ -160,7 +179,7 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     if payload.is_plain(g):
         return SPLATTING.render(model, view, request)
     backend, conventions, dtype, camera = request.backend, request.conventions, g.means.dtype, view.camera
-    if missing := request.wants - KNOWN:
+    if missing := request.wants - payload.channels(request.wants).keys() - MEASURES:
         raise InputError(
             f"{payload.plural} are drawn without {', '.join(sorted(missing))}: train a recipe that does without"
         )
@@ -172,9 +191,10 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     projected = Projected(g, primitives, camera, conventions, backend, projection)
     footprints = payload.footprints(projected)
     listed = payload.listed(footprints)
-    channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, listed.radii)  # [N, 3]
-    if "depth" in request.wants:
-        channels, background = append_depths(channels, background, listed.depths)
+    rgb = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, listed.radii)  # [N, 3]
+    carried = payload.carry(footprints, request.wants)  # [N, K]
+    channels = np.column_stack([rgb, carried.astype(dtype)])
+    background = np.append(background, np.zeros(carried.shape[1], dtype))
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(listed, grid, conventions)
     blended = footprints, payload.coefficients(projected, channels), background, bins
@@ -186,11 +206,13 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     with_stats, with_median_depth = "stats" in request.wants, "median_depth" in request.wants
     output = blend(*blended, conventions, with_stats=with_stats, with_median_depth=with_median_depth)
     output = output._replace(visible_ids=np.flatnonzero(listed.radii[:, 0] > 0), n_pairs=len(bins.gaussian_ids))
-    return output, PayloadTape(payload, projected, sh_degree, blended, output)
+    return output, PayloadTape(payload, projected, request.wants, sh_degree, blended, output)
 
 
-def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`_render`, the sum of those through the projection, the colours and the payload."""
+def render_payload_vjp(
+    tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None
+) -> RenderGradient:
+    """Gradient of :func:`render_payload`, the sum of those through the projection, the colours and the payload."""
     if isinstance(tape, RenderTape):
         return SPLATTING.render_vjp(tape, v_image, v_alpha)
     payload, projected = tape.payload, tape.projected
@@ -202,15 +224,15 @@ def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats
         v = kernel_hits.composite_hits_vjp(payload.response_for(g.means.dtype), *arguments)
     else:
         v = composite_hits_vjp(payload.response, *arguments)
-    v_means2d, v_conics, v_opacities, *v_carried = v.primitives
+    v_means2d, v_conics, v_opacities, *v_of_response = v.primitives
     v_channels, v_fields = payload.coefficients_vjp(projected, v.colors, v_image.shape[2])
 
-    v_depths = np.ascontiguousarray(v_channels[:, 3]) if v_image.shape[2] > 3 else np.zeros_like(projection.depths)
+    v_depths, v_of_carried = payload.carry_vjp(tape.blended[0], tape.wants, v_channels[:, 3:])
     v_projection = ProjectionGradient(v_means2d, v_depths, v_conics, v_opacities)
     v_flat = backend.project_vjp(*primitives, camera, conventions, projection, v_projection)
     v_rgb = np.ascontiguousarray(v_channels[:, :3])
     v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_rgb)
-    v_more = payload.footprints_vjp(projected, tuple(v_carried))
+    v_more = payload.footprints_vjp(projected, (*v_of_response, *v_of_carried))
     logits, v_scales = payload.opacity_logits(g), v_flat.scales + v_more.scales
     v_log_scales, v_logits = activate_vjp(primitives, logits, v_scales, v_flat.opacities)
     of_3dgs = {

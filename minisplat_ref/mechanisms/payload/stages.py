@@ -22,6 +22,7 @@ def renderer_stage(
     representation: Representation,
     sides_of: Callable[[TileHits, Floats], tuple[np.ndarray, ...]],
     rng: np.random.Generator,
+    wants: frozenset[str] = frozenset({"depth"}),
 ) -> Stage:
     """Return the renderer as a stage whose points record the hits, which the reference computes again.
 
@@ -32,11 +33,13 @@ def renderer_stage(
         :func:`minisplat_ref.mechanisms.payload.renderer.payload_renderer`.
     sides_of : callable
         Returns, for a tile's hits and the coefficients [N, S] of the colours, on which sides of thresholds they are.
+    wants : frozenset of str
+        Channels that are rendered besides RGB.
     """
     sides: list[np.ndarray] = []
 
     def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        output, tape = representation.renderer.render(model, view, request)
+        output, tape = representation.renderer.render(model, view, request._replace(wants=wants))
         footprints, coefficients, _, bins = tape.blended
         tiles = tile_hits(footprints, bins, setting.conventions, tape.payload.response)
         sides[:] = [bins.gaussian_ids, *(side for tile in tiles for side in sides_of(tile, coefficients))]

@@ -33,9 +33,51 @@ PLANE_MAX = 1e12  # largest entry of T^-1: discs seen more edge-on than that are
 
 
 @functools.cache
-def _surfel_response(exp: Callable, layout: tuple[int, int], has_hit_depths: bool, drops_near_hits: bool):
+def depth_shades(layout: tuple[int, int]) -> tuple[Callable, Callable]:
+    """Return ``shade`` and ``shade_vjp`` for the channels of a layout, -1 where there is none.
+
+    A place begins with the depth and ends with q_0.
+    """
     depth_channel, q_channel = layout
 
+    @scalar
+    def shade(colors, n, k, place):
+        depth, pivot = place[0], place[-1]
+        color = ZERO * depth + colors[n, k]
+        if k == depth_channel:
+            color = color + depth
+        elif k == q_channel:
+            color = color + (ONE / depth - pivot)
+        elif k == q_channel + 1 and q_channel >= 0:
+            q = ONE / depth - pivot
+            color = color + q * q
+        return color
+
+    @scalar
+    def shade_vjp(colors, n, k, place, v):
+        """With q = 1 / z - q_0: ``v_z = v_depth - (v_q + 2 q v_qq) / z^2``."""
+        depth, pivot = place[0], place[-1]
+        w = ONE / depth
+        v_z = ZERO * v
+        if k == depth_channel:
+            v_z = v
+        elif k == q_channel:
+            v_z = -v * w * w
+        elif k == q_channel + 1 and q_channel >= 0:
+            v_z = -TWO * (w - pivot) * v * w * w
+        return (v,), (v_z,)
+
+    return shade, shade_vjp
+
+
+def channels_of(layout: Layout) -> tuple[int, int]:
+    """Return a layout for kernels: -1 where it has no channel."""
+    depth, spread = (-1 if channel is None else channel for channel in layout)
+    return depth, spread
+
+
+@functools.cache
+def _surfel_response(exp: Callable, layout: tuple[int, int], has_hit_depths: bool, drops_near_hits: bool):
     @scalar
     def depth_of(is_met, z, center):
         """Return the depth of a hit as lanes."""
@@ -87,33 +129,7 @@ def _surfel_response(exp: Callable, layout: tuple[int, int], has_hit_depths: boo
             *(to_center * ox, to_center * oy, falloff * v_shape, v_depth),
         )
 
-    @scalar
-    def shade(colors, n, k, place):
-        depth, pivot = place[0], place[9]
-        color = ZERO * depth + colors[n, k]
-        if k == depth_channel:
-            color = color + depth
-        elif k == q_channel:
-            color = color + (ONE / depth - pivot)
-        elif k == q_channel + 1 and q_channel >= 0:
-            q = ONE / depth - pivot
-            color = color + q * q
-        return color
-
-    @scalar
-    def shade_vjp(colors, n, k, place, v):
-        """With q = 1 / z - q_0: ``v_z = v_depth - (v_q + 2 q v_qq) / z^2``."""
-        depth, pivot = place[0], place[9]
-        w = ONE / depth
-        v_z = ZERO * v
-        if k == depth_channel:
-            v_z = v
-        elif k == q_channel:
-            v_z = -v * w * w
-        elif k == q_channel + 1 and q_channel >= 0:
-            v_z = -TWO * (w - pivot) * v * w * w
-        return (v,), (v_z,)
-
+    shade, shade_vjp = depth_shades(layout)
     return KernelResponse(
         _records, _records_vjp, _boxes, hit, hit_vjp, N_GRADIENTS, shade, shade_vjp, n_coefficients=1, n_places=1
     )
@@ -121,9 +137,8 @@ def _surfel_response(exp: Callable, layout: tuple[int, int], has_hit_depths: boo
 
 def response_for(dtype: np.dtype, surfels: Surfels, layout: Layout) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
-    channels = tuple(-1 if channel is None else channel for channel in layout)
     rules = surfels.rules
-    return _surfel_response(choose_exponential(dtype), channels, rules.has_hit_depths, rules.drops_near_hits)
+    return _surfel_response(choose_exponential(dtype), channels_of(layout), rules.has_hit_depths, rules.drops_near_hits)
 
 
 def _planes(surfels: Surfels) -> tuple[Floats, Floats]:

@@ -37,8 +37,12 @@ def median_normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
 
 # Weights and dates of the released code: of 30,000 iterations. The distortion's weight is 0 there by default, 10 to 100
 # for most scenes and 1,000 for DTU, whose unit is a millimetre.
+NORMAL_CONSISTENCY = LossTerm(
+    "normal_consistency", normal_consistency, 0.05, frozenset({"normal", "depth"}), start=7_000
+)
+DISTORTION = LossTerm("distortion", distortion, 0.0, frozenset({"spread"}), start=3_000)
 LOSSES = (
-    LossTerm("normal_consistency", normal_consistency, 0.05, frozenset({"normal", "depth"}), start=7_000),
+    NORMAL_CONSISTENCY,
     LossTerm("median_normal_consistency", median_normal_consistency, 0.0, frozenset({"normal", "median"}), start=7_000),
-    LossTerm("distortion", distortion, 0.0, frozenset({"spread"}), start=3_000),
+    DISTORTION,
 )

@@ -153,7 +153,7 @@ def project(
         boxes=np.where(row, boxes, 0).astype(np.int32),
         rules=rules,
         near_plane=conventions.near_plane,
-        pivot=_pivot(x[is_visible, 2]),
+        pivot=choose_pivot(x[is_visible, 2]),
     )
 
 
@@ -263,7 +263,7 @@ def _intrinsics(camera: Camera) -> Floats:
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
 
 
-def _pivot(depths: Floats) -> float:
+def choose_pivot(depths: Floats) -> float:
     """Return the median inverse depth, rounded to three bits: a constant that does not follow the surfels."""
     if len(depths) == 0:
         return 0.0

@@ -11,7 +11,8 @@ of the hit is that of the centre; elsewhere it is ``z = M_w . (u, v, 1)``. Where
 disc, and only the low-pass is left.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -129,8 +130,13 @@ def hit_vjp(
 
 def surfel_response(layout: Layout) -> Response:
     """Return the response of surfels with the channels of a layout."""
+    return Response(lambda surfels: surfels.boxes, hit, hit_vjp, FIELDS, *depth_shades(layout))
 
-    def shade(colors: Floats, place: SurfelPlace) -> Floats:
+
+def depth_shades(layout: Layout) -> tuple[Callable[..., Floats], Callable[..., tuple[Floats, Floats]]]:
+    """Return the ``shade`` and ``shade_vjp`` of a response whose places have ``depths`` z [G, P] and a ``pivot``."""
+
+    def shade(colors: Floats, place: Any) -> Floats:
         channels = np.broadcast_to(colors[:, None], (*place.depths.shape, colors.shape[1])).copy()
         if layout.depth is not None:
             channels[:, :, layout.depth] += place.depths
@@ -140,7 +146,7 @@ def surfel_response(layout: Layout) -> Response:
             channels[:, :, layout.spread + 1] += q * q
         return channels
 
-    def shade_vjp(colors: Floats, place: SurfelPlace, v: Floats) -> tuple[Floats, Floats]:
+    def shade_vjp(colors: Floats, place: Any, v: Floats) -> tuple[Floats, Floats]:
         """With q = 1 / z - q_0: ``v_z = v_depth - (v_q + 2 q v_qq) / z^2``."""
         v_depths = np.zeros_like(place.depths)
         if layout.depth is not None:
@@ -151,4 +157,4 @@ def surfel_response(layout: Layout) -> Response:
             v_depths -= v_q / place.depths**2
         return v.sum(axis=1), v_depths
 
-    return Response(lambda surfels: surfels.boxes, hit, hit_vjp, FIELDS, shade, shade_vjp)
+    return shade, shade_vjp
