@@ -60,6 +60,12 @@ FLOATS = declare(
     f"{__name__}.study.run",
     *(RESUMED_OUT, iterations(600), seeds(3)),
 )
+GROWTH = declare(
+    "growth",
+    "trainings with and without the growing of anchors",
+    f"{__name__}.growth_study.run",
+    *(RESUMED_OUT, iterations(2_000), seeds(3)),
+)
 EXTENSION = Extension(
     "cus",
     recipes=(CUS,),
@@ -67,6 +73,6 @@ EXTENSION = Extension(
     save=save,
     stages=stages,
     commands=(features,),
-    studies=(FLOATS,),
+    studies=(FLOATS, GROWTH),
 )
-"""The recipe ``cus`` with its renderer, a command and a study."""
+"""The recipe ``cus`` with its renderer, a command and two studies."""

@@ -178,7 +178,8 @@ def counts(model: Model) -> dict[str, int]:
     return {"gaussians": len(g.means) * n_children, "all_floats": floats}
 
 
-def _psnr(model: Model, scene: Scene, recipe: Recipe) -> float | None:
+def psnr_of(model: Model, scene: Scene, recipe: Recipe) -> float | None:
+    """Return the mean PSNR of the held-out views, dB."""
     return evaluate(model, scene.test_views, RenderSettings(scene.background, renderer=recipe.renderer)).psnr
 
 
@@ -198,7 +199,7 @@ def measure(made: SyntheticScene, iterations: int, seed: int) -> list[dict[str, 
             records.append(
                 {
                     "arm": f"{ANCHOR_ARM}, latent {latent}",
-                    "psnr": _psnr(model, task.scene, recipe),
+                    "psnr": psnr_of(model, task.scene, recipe),
                     **counts(model),
                     "floats": feature_floats(model),
                     **quality(task, lambda view, model=model: features_of_anchors(model, view)),  # type: ignore[misc]
@@ -215,7 +216,7 @@ def measure(made: SyntheticScene, iterations: int, seed: int) -> list[dict[str, 
             records.append({"arm": f"{OWN}, {width}", "floats": found["queries"].size, **quality(task, features_of)})
         recipe = find_recipe("adaptive", iterations)
         model = kit.train_with_progress(task.scene, recipe, seed).model
-        records.append({"arm": "adaptive", "psnr": _psnr(model, task.scene, recipe), **counts(model)})
+        records.append({"arm": "adaptive", "psnr": psnr_of(model, task.scene, recipe), **counts(model)})
     return records
 
 
