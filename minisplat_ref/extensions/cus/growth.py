@@ -123,7 +123,9 @@ def grow(anchors: Anchors, gradients: Floats, side: float, threshold: float, rng
     return Edit(grown, parent_ids, np.arange(len(parent_ids)) >= n)
 
 
-def grow_anchors(state: TrainState, iteration: Iteration, *, voxel: float, growth_threshold: float) -> str | None:
+def grow_anchors(
+    state: TrainState, iteration: Iteration, *, voxel: float, growth_threshold: float | None
+) -> str | None:
     """Do :func:`grow` by the gradients collected since the last time, and collect anew.
 
     Parameters
@@ -132,11 +134,13 @@ def grow_anchors(state: TrainState, iteration: Iteration, *, voxel: float, growt
     iteration : Iteration
     voxel : float
         Side of the first voxels in units of the points' median scale, as for :func:`.population.as_anchors`.
-    growth_threshold : float
-        tau.
+    growth_threshold : float or None
+        tau; None: there is no growing.
     """
-    counts = state.stats.pop(COUNT)
-    gradients = np.where(counts > 0, state.stats.pop(SUM) / np.maximum(counts, 1), np.nan)
+    counts, sums = state.stats.pop(COUNT), state.stats.pop(SUM)
+    if growth_threshold is None:
+        return "nothing done: growth_threshold is none"
+    gradients = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
     first = initial_gaussians(iteration.scene, 0, np.random.default_rng(0))  # draws only where there are no points
     edit = grow(state.gaussians, gradients, voxel_side(first, voxel), growth_threshold, state.rng)
     n_new = int(edit.is_new.sum())

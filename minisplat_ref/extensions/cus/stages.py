@@ -4,9 +4,10 @@ Everything that the recipe holds still is differentiated, too. A ReLU has a kink
 
 Steps of differences have to be large beside rounding, and small beside the distance to the next threshold. So there are
 few anchors, with Gaussians so large that few of their rims, where alpha falls below its least value, are in the image;
-most ReLUs are on; and features are near those that are wanted, so that the loss is no larger than its gradients. The
-oracle's own check of the loss, which this one replaces, has photographs of noise with the recipe's networks: gradients
-there are a thousandth of the loss, and the last digit of the loss is all that is left of the tolerance.
+most ReLUs are on; and features are large, and near those that are wanted, so that the loss is no larger than its
+gradients. The oracle's own check of the loss, which this one replaces, has photographs of noise, whose features are
+all alike, and the recipe's networks: gradients there are a thousandth of the loss, so that the last digit of the loss
+uses up the tolerance.
 """
 
 from collections.abc import Mapping
@@ -44,8 +45,9 @@ SPREAD = 0.5  # of random weights
 VOXEL, N_ANCHORS = 8.0, 8  # side in units of the median scale, and the most that are taken
 WIDER = 3.0  # than anchors begin with
 ON = 0.5  # is added to what ReLUs read
-NEAR = 0.1  # standard deviation of features from those that are wanted
-N_PIXELS = 40  # that the loss compares, at most
+LONG, SHORT = 10.0, 0.02  # memory and keys of the loss: large features, and attention to more than one row
+NEAR = 1.0  # standard deviation of features from those that are wanted
+N_PIXELS = 12  # that the loss compares, at most
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
@@ -174,6 +176,8 @@ def _queries_stage(backend: Backend, setting: Setting, rng: np.random.Generator)
 def _loss_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
     """Return the error of the features that a view reads as a function of everything that is read."""
     movable = _movable(setting, rng)
+    for name, factor in ((MEMORY, LONG), (KEYS, SHORT)):
+        movable.inputs[name] = movable.model.shared[name][:] = factor * movable.model.shared[name]
     width, height = setting.camera.width, setting.camera.height
     drawn = rng.choice(width * height, min(N_PIXELS, width * height), replace=False)
     pixels = np.stack(np.divmod(drawn, width), axis=1)
