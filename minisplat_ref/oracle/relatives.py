@@ -73,8 +73,8 @@ def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> li
     core = [term for recipe in RECIPES.values() for term in recipe.losses]
     terms = own_terms([*relative.losses, *(term for recipe in relative.recipes for term in recipe.losses)], core)
     checked = {case.name.rpartition(":")[0] for case in cases}
-    terms = [term for term in terms if stage_name(term) not in checked]
-    for term in with_progress(terms, f"{backend.name}, losses", "terms"):
+    left = [term for term in terms if stage_name(term) not in checked]
+    for term in with_progress(left, f"{backend.name}, losses", "terms"):
         cases += loss_cases(term, backend, conventions, relative.representation)
     return cases
 

@@ -16,7 +16,7 @@ what a new anchor begins with, either: here with latent and colour of the anchor
 in the voxel. Gradients are those of the photometric loss.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -112,7 +112,8 @@ def grow(anchors: Anchors, gradients: Floats, side: float, threshold: float, rng
     is_seen = ~np.isnan(gradients)
     points = (anchors.means[:, None] + anchors.offsets.reshape(n, k, 3))[is_seen]
     owners = np.repeat(np.arange(n), k).reshape(n, k)[is_seen]
-    grown, parent_ids = anchors, np.arange(n)
+    parent_ids = np.arange(n)
+    grown: Any = anchors
     for level in range(N_LEVELS):
         side_here = side * COARSEST / FINER**level
         found = find_candidates(points, gradients[is_seen], grown.means, side_here, threshold * STEEPER**level)
