@@ -196,6 +196,8 @@ def test_gradients_are_checked_far_from_thresholds_and_rounding(number):
 def test_the_oracle_leaves_the_loss_of_features_to_the_stage(monkeypatch):
     """A stage with the name of a term replaces its check; the other term is checked as before."""
     stage = Stage("loss term feature_loss", {"x": np.ones(1)}, ("y",), lambda x: Point((3 * x,)), lambda v: (3 * v,))
+    own = [stage.name for stage in stages(CPU, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))]
+    assert own == ["render anchors", "blended_queries", "read", stage.name]
     plain = Relative("cus", GAUSSIANS, find_recipe("cus").losses, (), lambda *_: (stage,))
     names = [case.name for case in check_relative_gradients((CPU,), GSPLAT_MAIN, plain).cases]
     assert [name for name in names if "feature_loss" in name] == [f"{stage.name}: {kind}" for kind in WAYS]
@@ -314,6 +316,8 @@ def test_cells_of_a_coarse_map():
     coarse = np.arange(4.0).reshape(2, 2, 1)
     pixels = np.array([[0, 0], [1, 2], [1, 3], [2, 2], [4, 5]])
     assert maps.at_pixels(coarse, pixels, 5, 6)[:, 0].tolist() == [0, 0, 1, 2, 3]
+    middle = np.array([[0, 0], [0, 1], [1, 1]])  # of three columns over two, the middle one is the second's, too
+    assert maps.at_pixels(coarse, middle, 3, 3)[:, 0].tolist() == [0, 1, 3]
 
 
 def test_given_maps(tmp_path):

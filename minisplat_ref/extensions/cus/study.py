@@ -30,7 +30,7 @@ from minisplat_ref.extensions.cus.decoding import decode
 from minisplat_ref.extensions.cus.losses import blended_queries, drawn_pixels, read_memory
 from minisplat_ref.extensions.cus.maps import feature_map
 from minisplat_ref.extensions.cus.method import ANCHORS, CUS, LATENT
-from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, MIX, QUERY, Anchors
+from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, QUERY, Anchors
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.mechanisms.features.blending import blend_channels, blend_channels_vjp
 from minisplat_ref.mechanisms.networks.networks import COMPILED
@@ -131,7 +131,7 @@ def features_of_anchors(model: Model, view: View) -> Floats:
 
 def feature_floats(model: Model) -> int:
     """Return the floats that anchors have for their features: latents, the network of queries and its mixture."""
-    shared = sum(array.size for name, array in model.shared.items() if name.startswith((QUERY, MIX)))
+    shared = sum(array.size for name, array in model.shared.items() if name.startswith(QUERY))
     return int(model.gaussians.latents.size) + shared
 
 
