@@ -461,8 +461,8 @@ def test_a_file_says_that_it_lacks_the_network(run_folder, capfd):
 
 def test_features_of_a_run_are_what_its_views_read(run_folder, tmp_path, capfd):
     assert main(["cus", "features", str(run_folder), "--out", str(tmp_path / "found")]) == 0
-    assert "3 channels, in" in capfd.readouterr().out
     names = sorted(path.stem for path in (tmp_path / "found").iterdir())
+    assert f"features of {len(names)} views, 3 channels, in" in capfd.readouterr().out
     assert names == sorted(path.stem for path in (run_folder.parent / "maps").iterdir())
     with np.load(run_folder / "shared.npz") as stored:
         model = Model(load_ply(run_folder / "point_cloud.ply", Anchors), dict(stored))

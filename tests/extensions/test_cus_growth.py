@@ -119,7 +119,7 @@ def test_voxels_by_hand():
 
 def test_levels_by_hand(rng):
     """Sides are 16, 4 and 1, thresholds 1, 2 and 4; Gaussians that no view saw have no voice."""
-    points = [[5.9, 0, 0], [30, 0, 0], [50.6, 0, 0], [70, 0, 0]]
+    points = [[5.9, 0, 0], [30, 0, 0], [50.6, 0, 0], [49, 0, 0]]  # the last, unseen, in the third's voxel
     anchors = anchors_of(points, rng)
     gradients = np.array([[5.0, 3.0], [1.5, np.nan]])
     edit = grow(anchors, gradients, 1.0, 1.0, Merciful(rng))
@@ -221,3 +221,18 @@ def test_the_study_of_growing_runs(tmp_path, monkeypatch, capsys):
     per_anchor = 3 + 3 + 3 + 3 + 6  # centre, scale, colour, latent, offsets
     assert records[1]["all_floats"] - records[0]["all_floats"] == per_anchor * (anchors[1] - anchors[0])
     assert "| 40 points, with growing " in capsys.readouterr().out
+
+
+def test_the_table_of_growing_by_hand():
+    def record(arm, anchors, psnr, error):
+        return {"arm": arm, "anchors": anchors, "all_floats": 10 * anchors, "psnr": psnr, "error": error, "iou": 0.5}
+
+    names = ("2,000 points, without growing", "2,000 points, with growing")
+    records = [record(names[0], 100, 20, 0.1), record(names[1], 180, 21, 0.2)]
+    records += [record(names[0], 120, 22, 0.3), record(names[1], 240, 21, 0.4)]
+    text = growth_study.report(records, {}, "heading").text
+    header = "| arm | anchors | floats in all | PSNR dB | error of features | mean IoU |"
+    assert header in [" ".join(line.split()) for line in text.splitlines()]
+    rows = [" ".join(line.split()) for line in text.splitlines() if line.startswith("| 2,000")]
+    assert rows[0].startswith(f"| {names[0]} | 110 | 1,100 | 21.00 ± 1.41 | 0.2000 ± 0.1414 | 0.500 ")
+    assert rows[1].startswith(f"| {names[1]} | 210 | 2,100 | 21.00 ± 0.00 | 0.3000 ± 0.1414 | 0.500 ")
