@@ -47,16 +47,21 @@ WIDER = 3.0  # than anchors begin with
 ON = 0.5  # is added to what ReLUs read
 LONG, SHORT = 10.0, 0.02  # memory and keys of the loss: large features, and attention to more than one row
 NEAR = 1.0  # standard deviation of features from those that are wanted
+MODELS = 3  # seed of the models: with it no gradient is small beside the values of which differences are taken
 N_PIXELS = 12  # that the loss compares, at most
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return all; the first replaces that of the renderer as a whole, the last the oracle's of the loss of features."""
+    """Return all; the first replaces that of the renderer as a whole, the last the oracle's of the loss of features.
+
+    The models have a seed of their own, so that no check before this one changes at which point it is made.
+    """
+    own = np.random.default_rng(MODELS)
     return (
-        _renderer_stage(backend, setting, rng),
-        _queries_stage(backend, setting, rng),
-        _reading_stage(rng),
-        _loss_stage(backend, setting, rng),
+        _renderer_stage(backend, setting, own),
+        _queries_stage(backend, setting, own),
+        _reading_stage(own),
+        _loss_stage(backend, setting, own),
     )
 
 
