@@ -56,7 +56,7 @@ class RenderGradient(NamedTuple):
     background: Floats  # [3]
     cam_from_world_R: Floats  # [3, 3] with respect to the nine entries, unconstrained
     cam_from_world_t: Floats  # [3]
-    means2d: Floats  # [N, 2] with respect to the projected centres, per pixel: input of density control
+    means2d: Floats  # [N, 2], or [N, 2 K] of rows drawn as K Gaussians: of the projected centres, for density control
     shared: Mapping[str, Floats] = NOTHING  # with respect to the model's shared parameters, by name
 
 

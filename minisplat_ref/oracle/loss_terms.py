@@ -65,7 +65,7 @@ def loss_cases(
         if stage is not None:
             return [*cases, inner_product_case(stage, rng, settled_derivative)]
     note = f"it is zero in iterations {term.start + 1} to {term.start + N_STEPS}, so that nothing was checked"
-    return cases or [Case(_name(term), False, {}, note)]
+    return cases or [Case(stage_name(term), False, {}, note)]
 
 
 def loss_stage(
@@ -127,10 +127,11 @@ def loss_stage(
         v = _by_name(evaluate({}, step)[1])
         return tuple(float(v_loss) * v.get(name, np.zeros_like(array)) for name, array in inputs.items())
 
-    return Stage(_name(term), inputs, ("loss",), function, vjp)
+    return Stage(stage_name(term), inputs, ("loss",), function, vjp)
 
 
-def _name(term: LossTerm) -> str:
+def stage_name(term: LossTerm) -> str:
+    """Return the name of a term's stage; an extension's own stage of this name replaces it."""
     return f"loss term {term.name}"
 
 

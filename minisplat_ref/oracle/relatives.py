@@ -1,8 +1,9 @@
 """The gradient proof of a relative of 3DGS: everything that it has of its own, on every backend.
 
 That is its renderer, with every field and shared parameter and, where a recipe of it switches calibrations on, with
-these around it; its loss terms; and the stages that it names. What it shares with 3DGS is checked without it. A
-relative that has nothing of its own to check does not pass: there is nothing that the check could have found.
+these around it; its loss terms, but for those that a stage of its own replaces by its name; and the stages that it
+names. What it shares with 3DGS is checked without it. A relative that has nothing of its own to check does not pass:
+there is nothing that the check could have found.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.oracle.gradients import by_backend
-from minisplat_ref.oracle.loss_terms import loss_cases, own_terms
+from minisplat_ref.oracle.loss_terms import loss_cases, own_terms, stage_name
 from minisplat_ref.oracle.models import TIME, Stages, model_cases
 from minisplat_ref.oracle.pieces import SEED
 from minisplat_ref.progress import with_progress
@@ -71,7 +72,9 @@ def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> li
             cases += model_cases(backend, conventions, calibrated, None)
     core = [term for recipe in RECIPES.values() for term in recipe.losses]
     terms = own_terms([*relative.losses, *(term for recipe in relative.recipes for term in recipe.losses)], core)
-    for term in with_progress(terms, f"{backend.name}, losses", "terms"):
+    checked = {case.name.rpartition(":")[0] for case in cases}
+    left = [term for term in terms if stage_name(term) not in checked]
+    for term in with_progress(left, f"{backend.name}, losses", "terms"):
         cases += loss_cases(term, backend, conventions, relative.representation)
     return cases
 

@@ -31,7 +31,8 @@ def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
     Parameters
     ----------
     v_means2d : ndarray of shape (V, 2)
-        Gradient with respect to the projected centres, per pixel.
+        Gradient with respect to the projected centres, per pixel. Of rows that are drawn as K Gaussians [V, 2 K]: the
+        sum over these counts.
     width, height : int
         Image size, pixels.
 
@@ -39,7 +40,8 @@ def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
     -------
     norms : ndarray of shape (V,)
     """
-    v_x, v_y = 0.5 * width * v_means2d[:, 0], 0.5 * height * v_means2d[:, 1]  # [V]
+    sums = v_means2d if v_means2d.shape[1] == 2 else v_means2d.reshape(len(v_means2d), -1, 2).sum(axis=1)
+    v_x, v_y = 0.5 * width * sums[:, 0], 0.5 * height * sums[:, 1]  # [V]
     return np.sqrt(v_x * v_x + v_y * v_y)
 
 

@@ -93,7 +93,7 @@ class Iteration(NamedTuple):
     visible_ids: Ints
     """[V] rows that the view saw (radius above zero), ascending."""
     v_means2d: Floats
-    """[N, 2] gradient of the loss with respect to the projected centres, per pixel."""
+    """[N, 2] gradient of the loss with respect to the projected centres, per pixel; [N, 2 K] if rows are drawn as K."""
     render_settings: RenderSettings = RenderSettings()
     """How the model is rendered."""
     representation: Representation = GAUSSIANS

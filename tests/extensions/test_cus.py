@@ -38,14 +38,19 @@ from minisplat_ref.mechanisms.features.blending import blend_channels
 from minisplat_ref.mechanisms.features.filters import CONSTANT
 from minisplat_ref.mechanisms.networks.mlp import Layer, to_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-from minisplat_ref.oracle.differences import settled_derivative
+from minisplat_ref.oracle.differences import Point, settled_derivative
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.loss_terms import loss_stage
 from minisplat_ref.oracle.models import noisy_model, training_view
-from minisplat_ref.oracle.pieces import tiny_setting
+from minisplat_ref.oracle.pieces import SEED, tiny_setting
+from minisplat_ref.oracle.relatives import Relative, check_relative_gradients
+from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.oracle.tolerances import GRADIENT_REL
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import LossTerm, Rendered
+from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians, Model, RenderOutput, View, view_from
@@ -53,6 +58,7 @@ from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 RENDERER = ANCHORS.renderer
+WAYS = ("Jacobian", "inner products")  # of checking a gradient
 
 
 def one_child(g):
@@ -170,11 +176,32 @@ def test_statistics_are_those_of_anchors(rng):
 # Gradients and backends
 
 
-@pytest.mark.parametrize("number", range(3))
-def test_gradients(number, rng):
-    """The renderer with every parameter, the blended queries, and the reading of the memory."""
-    case = jacobian_case(stages(REFERENCE, tiny_setting(GSPLAT_MAIN), rng)[number])
+@pytest.mark.parametrize(("number", "backend"), [(0, REFERENCE), (1, REFERENCE), (2, REFERENCE), (3, CPU)])
+def test_gradients(number, backend, rng):
+    """The renderer with every parameter, the blended queries, the reading of the memory, and the loss of features."""
+    case = jacobian_case(stages(backend, tiny_setting(GSPLAT_MAIN), rng)[number])
     assert case.passed, case
+
+
+@pytest.mark.parametrize("number", [0, 1, 3])
+def test_gradients_are_checked_far_from_thresholds_and_rounding(number):
+    """Along random directions, no step is so small that the wider limit counts, and a fifth of the limit is enough."""
+    rng = np.random.default_rng(SEED)
+    larger = make_setting(rng, 60, 40, 30, GSPLAT_MAIN, sh_degree=3)
+    case = inner_product_case(stages(CPU, larger, rng)[number], rng)
+    assert case.passed and case.figures["limit"] == GRADIENT_REL, case
+    assert case.figures["error"] < GRADIENT_REL / 5 and case.figures["step"] >= 1e-6, case
+
+
+def test_the_oracle_leaves_the_loss_of_features_to_the_stage(monkeypatch):
+    """A stage with the name of a term replaces its check; the other term is checked as before."""
+    stage = Stage("loss term feature_loss", {"x": np.ones(1)}, ("y",), lambda x: Point((3 * x,)), lambda v: (3 * v,))
+    own = [stage.name for stage in stages(CPU, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))]
+    assert own == ["render anchors", "blended_queries", "read", stage.name]
+    plain = Relative("cus", GAUSSIANS, find_recipe("cus").losses, (), lambda *_: (stage,))
+    names = [case.name for case in check_relative_gradients((CPU,), GSPLAT_MAIN, plain).cases]
+    assert [name for name in names if "feature_loss" in name] == [f"{stage.name}: {kind}" for kind in WAYS]
+    assert [name for name in names if "anchor_scale" in name] == [f"loss term anchor_scale: {kind}" for kind in WAYS]
 
 
 def test_the_gradient_of_the_feature_loss(rng, tmp_path):
@@ -289,6 +316,8 @@ def test_cells_of_a_coarse_map():
     coarse = np.arange(4.0).reshape(2, 2, 1)
     pixels = np.array([[0, 0], [1, 2], [1, 3], [2, 2], [4, 5]])
     assert maps.at_pixels(coarse, pixels, 5, 6)[:, 0].tolist() == [0, 0, 1, 2, 3]
+    middle = np.array([[0, 0], [0, 1], [1, 1]])  # of three columns over two, the middle one is the second's, too
+    assert maps.at_pixels(coarse, middle, 3, 3)[:, 0].tolist() == [0, 1, 3]
 
 
 def test_given_maps(tmp_path):
@@ -432,8 +461,8 @@ def test_a_file_says_that_it_lacks_the_network(run_folder, capfd):
 
 def test_features_of_a_run_are_what_its_views_read(run_folder, tmp_path, capfd):
     assert main(["cus", "features", str(run_folder), "--out", str(tmp_path / "found")]) == 0
-    assert "3 channels, in" in capfd.readouterr().out
     names = sorted(path.stem for path in (tmp_path / "found").iterdir())
+    assert f"features of {len(names)} views, 3 channels, in" in capfd.readouterr().out
     assert names == sorted(path.stem for path in (run_folder.parent / "maps").iterdir())
     with np.load(run_folder / "shared.npz") as stored:
         model = Model(load_ply(run_folder / "point_cloud.ply", Anchors), dict(stored))

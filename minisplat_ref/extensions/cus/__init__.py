@@ -16,10 +16,16 @@ The loss is that of 3DGS, with 0.1 (L2 + 1 - cos) of the features and 0.01 times
 
     S = 2 |z| + 8 |dL/dz| + sum_n hits_n o_n V_n
 
+Anchors are those of Scaffold-GS (Lu et al. 2023, arXiv 2312.00109), whose rule by which they grow is here, too
+(:mod:`.growth`). It is off unless a threshold is given: from many points it adds floats and hardly any quality, from
+few it helps.
+
     minisplat-ref train SCENE --recipe cus --out runs/anchors
     minisplat-ref train SCENE --recipe cus --set features=DIR --out runs/anchors
+    minisplat-ref train SCENE --recipe cus --set growth_threshold=2e-4 --out runs/anchors
     minisplat-ref cus features runs/anchors --out maps
     minisplat-ref study cus/floats --out DIR
+    minisplat-ref study cus/growth --out DIR
     minisplat-ref oracle gradients --extension cus
 
 ``features=DIR`` has a map for each photograph, ``NAME.npy`` or ``NAME.npz`` of [h, w, D], of whatever network; without
@@ -34,7 +40,7 @@ layers, but for that of the query, start at 0. Voxels are as large as the median
 and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights, gamma and rates
 are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
 
-Left out: the growing of anchors, and the language model.
+Left out: the language model, and the pruning of anchors by opacity, which in Scaffold-GS accompanies their growing.
 """
 
 from pathlib import Path
@@ -60,6 +66,12 @@ FLOATS = declare(
     f"{__name__}.study.run",
     *(RESUMED_OUT, iterations(600), seeds(3)),
 )
+GROWTH = declare(
+    "growth",
+    "trainings with and without the growing of anchors",
+    f"{__name__}.growth_study.run",
+    *(RESUMED_OUT, iterations(2_000), seeds(3)),
+)
 EXTENSION = Extension(
     "cus",
     recipes=(CUS,),
@@ -67,6 +79,6 @@ EXTENSION = Extension(
     save=save,
     stages=stages,
     commands=(features,),
-    studies=(FLOATS,),
+    studies=(FLOATS, GROWTH),
 )
-"""The recipe ``cus`` with its renderer, a command and a study."""
+"""The recipe ``cus`` with its renderer, a command and two studies."""

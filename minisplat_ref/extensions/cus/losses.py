@@ -88,11 +88,28 @@ def feature_loss(rendered: Rendered, *, features: str, samples: int) -> tuple[fl
     pixels = drawn_pixels(view, samples, rendered.step)
     if not len(pixels):
         return 0.0, Cotangents()
-    image, tape = blended_queries(model, view, rendered.request)
+    wanted = at_pixels(target, pixels, view.camera.height, view.camera.width)
+    return error_at_pixels(model, view, rendered.request, pixels, wanted)
+
+
+def error_at_pixels(
+    model: Model, view: View, request: Request, pixels: Ints, wanted: Floats
+) -> tuple[float, Cotangents]:
+    """Return the error of the features that a view reads at pixels, and its derivatives.
+
+    Parameters
+    ----------
+    model, view, request
+        As for :func:`blended_queries`.
+    pixels : ndarray of shape (B, 2)
+        Rows and columns.
+    wanted : ndarray of shape (B, D)
+        Features of the photograph there.
+    """
+    image, tape = blended_queries(model, view, request)
     rows, columns = pixels.T
     found, reading = read_memory(image[rows, columns], model.shared)
-    wanted = at_pixels(target, pixels, view.camera.height, view.camera.width).astype(found.dtype)
-    value, v_found = feature_error(found, wanted)
+    value, v_found = feature_error(found, wanted.astype(found.dtype))
     v_queries, v_memory, v_keys, v_adapter = read_vjp(reading, v_found)
     v_image = np.zeros_like(image)
     v_image[rows, columns] = v_queries

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.cus.decoding import Decoded, decode, decode_vjp
+from minisplat_ref.extensions.cus.growth import collect_gradients_of_children, grow_anchors
 from minisplat_ref.extensions.cus.losses import anchor_scale, feature_loss
 from minisplat_ref.extensions.cus.population import ANCHOR_RATES, FIXED, UNITS, Anchors, as_anchors, initial_shared
 from minisplat_ref.mechanisms.networks.networks import networks_for
@@ -14,7 +15,7 @@ from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.training.schedule import Every
+from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import BlendStats, Floats, Gaussians, Model, RenderOutput, View
 
@@ -66,7 +67,7 @@ def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> Re
         gaussians=found.anchors,
         cam_from_world_R=v.cam_from_world_R + found.cam_from_world_R,
         cam_from_world_t=v.cam_from_world_t + found.cam_from_world_t,
-        means2d=v.means2d.reshape(-1, k, 2).sum(axis=1),
+        means2d=v.means2d.reshape(-1, 2 * k),
         shared={**v.shared, **found.shared},
     )
 
@@ -161,6 +162,11 @@ CUS = GS_ACCEL._replace(
         LossTerm("feature_loss", partial(feature_loss, features="", samples=2_048), 0.1),
         LossTerm("anchor_scale", anchor_scale, 0.01),
     ),
-    events=(Every(1_000, partial(prune_insignificant, share=0.001), start=1_500, stop=15_000, min_gap=100),),
+    events=(
+        During(collect_gradients_of_children, start=500, stop=15_000),
+        # before the growing, as new anchors have no mean gradient yet by which to be judged
+        Every(1_000, partial(prune_insignificant, share=0.001), start=1_500, stop=15_000, min_gap=100),
+        Every(100, partial(grow_anchors, voxel=1.0, growth_threshold=None), start=1_500, stop=15_000, min_gap=100),
+    ),
 )
 """``cus``: anchors with networks, and the features of the photographs."""

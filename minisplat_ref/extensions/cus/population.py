@@ -55,8 +55,7 @@ def as_anchors(gaussians: Gaussians, rng: np.random.Generator, *, voxel: float, 
     """Return an anchor for each voxel that has a Gaussian, with the mean colour of these.
 
     Voxels have the side ``l = voxel s``, where s is the median scale of the Gaussians, at the start the distance of a
-    point to its neighbours. The K offsets are drawn evenly over the voxel, and the scale is ``l / sqrt(K)``, as K
-    Gaussians side by side cover a surface through it.
+    point to its neighbours.
 
     Parameters
     ----------
@@ -76,20 +75,53 @@ def as_anchors(gaussians: Gaussians, rng: np.random.Generator, *, voxel: float, 
     """
     if children < 1 or latent < 1 or not voxel > 0:
         raise InputError(f"children={children} and latent={latent} are numbers from 1 on, voxel={voxel:g} is above 0")
-    dtype = gaussians.means.dtype
-    side = voxel * float(np.exp(np.median(gaussians.log_scales.astype(np.float64)))) if len(gaussians.means) else 1.0
+    side = voxel_side(gaussians, voxel)
     cells, rows = np.unique(np.round(gaussians.means.astype(np.float64) / side), axis=0, return_inverse=True)
     n, rows = len(cells), rows.ravel()
     counts = np.maximum(np.bincount(rows, minlength=n), 1)
     colors = np.stack([np.bincount(rows, weights=channel, minlength=n) for channel in gaussians.sh_dc.T], axis=1)
+    dtype = gaussians.means.dtype
+    latents = (LATENT_SPREAD * rng.normal(size=(n, latent))).astype(dtype)
+    return at_rest(cells * side, (colors / counts[:, None]).astype(dtype), latents, side, children, rng)
+
+
+def voxel_side(gaussians: Gaussians, voxel: float) -> float:
+    """Return the side l of voxels, world units: ``voxel`` times the median scale of Gaussians, 1 if there are none."""
+    if not len(gaussians.means):
+        return 1.0
+    return voxel * float(np.exp(np.median(gaussians.log_scales.astype(np.float64))))
+
+
+def at_rest(
+    centers: Floats, sh_dc: Floats, latents: Floats, side: float, children: int, rng: np.random.Generator
+) -> Anchors:
+    """Return anchors as they begin.
+
+    The offsets are drawn evenly over the voxel, and the scale is ``side / sqrt(K)``, as K Gaussians side by side cover
+    a surface through it.
+
+    Parameters
+    ----------
+    centers : ndarray of shape (N, 3)
+        World frame.
+    sh_dc : ndarray of shape (N, 3)
+    latents : ndarray of shape (N, L)
+        Of the dtype that all fields get.
+    side : float
+        Of the voxels, world units.
+    children : int
+        K.
+    rng : numpy.random.Generator
+    """
+    n, dtype = len(centers), latents.dtype
     return Anchors(
-        means=(cells * side).astype(dtype),
+        means=centers.astype(dtype),
         quats=np.tile(np.array([1.0, 0, 0, 0], dtype), (n, 1)),
         log_scales=np.full((n, 3), np.log(side / np.sqrt(children)), dtype),
         opacity_logits=np.full(n, logit(INITIAL_OPACITY), dtype),
-        sh_dc=(colors / counts[:, None]).astype(dtype),
+        sh_dc=sh_dc,
         sh_rest=np.zeros((n, 0, 3), dtype),
-        latents=(LATENT_SPREAD * rng.normal(size=(n, latent))).astype(dtype),
+        latents=latents,
         offsets=(side * rng.uniform(-0.5, 0.5, size=(n, 3 * children))).astype(dtype),
     )
 

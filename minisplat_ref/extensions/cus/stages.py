@@ -1,39 +1,68 @@
-"""What the gradient check looks at: the renderer and the blended queries with small networks, and how memory is read.
+"""What the gradient check looks at: with small networks the renderer, blended queries and their loss; reading a memory.
 
 Everything that the recipe holds still is differentiated, too. A ReLU has a kink at 0, whose sides are part of a point.
+
+Steps of differences have to be large beside rounding, and small beside the distance to the next threshold. So there are
+few anchors, with Gaussians so large that few of their rims, where alpha falls below its least value, are in the image;
+most ReLUs are on; and features are large, and near those that are wanted, so that the loss is no larger than its
+gradients. The oracle's own check of the loss, which this one replaces, has photographs of noise, whose features are
+all alike, and the recipe's networks: gradients there are a thousandth of the loss, so that the last digit of the loss
+uses up the tolerance.
 """
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.cus.bank import feature_error, read, read_vjp
 from minisplat_ref.extensions.cus.decoding import decode
-from minisplat_ref.extensions.cus.losses import blended_queries, blended_queries_vjp
+from minisplat_ref.extensions.cus.losses import (
+    FeatureTape,
+    blended_queries,
+    blended_queries_vjp,
+    error_at_pixels,
+    read_memory,
+)
 from minisplat_ref.extensions.cus.method import ANCHORS
-from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, as_anchors, initial_shared
+from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, MIX, Anchors, as_anchors, initial_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage, noisy_model, training_view
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage, watch
 from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.ops import take
+from minisplat_ref.training.losses import Cotangents
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
+from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, Scene, View
 
-CHILDREN, LATENT, HIDDEN, EMBEDDING, QUERY = 2, 2, 3, 4, 4
+CHILDREN, LATENT, HIDDEN, EMBEDDING, QUERY = 2, 2, 5, 4, 4
 N_REMEMBERED, N_CHANNELS = 3, 5
 SPREAD = 0.5  # of random weights
-VOXEL = 8.0  # few anchors: among many, steps between thresholds are so small that they round
+VOXEL, N_ANCHORS = 8.0, 8  # side in units of the median scale, and the most that are taken
+WIDER = 3.0  # than anchors begin with
+ON = 0.5  # is added to what ReLUs read
+LONG, SHORT = 10.0, 0.02  # memory and keys of the loss: large features, and attention to more than one row
+NEAR = 1.0  # standard deviation of features from those that are wanted
+MODELS = 3  # seed of the models: with it no gradient is small beside the values of which differences are taken
+N_PIXELS = 12  # that the loss compares, at most
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return all; the first replaces that of the renderer as a whole."""
-    return _renderer_stage(backend, setting, rng), _queries_stage(backend, setting, rng), _reading_stage(rng)
+    """Return all; the first replaces that of the renderer as a whole, the last the oracle's of the loss of features.
+
+    The models have a seed of their own, so that no check before this one changes at which point it is made.
+    """
+    own = np.random.default_rng(MODELS)
+    return (
+        _renderer_stage(backend, setting, own),
+        _queries_stage(backend, setting, own),
+        _reading_stage(own),
+        _loss_stage(backend, setting, own),
+    )
 
 
 def small(rng: np.random.Generator) -> Representation:
@@ -52,9 +81,14 @@ def small(rng: np.random.Generator) -> Representation:
             similarity=1.0,
         )
         found = {name: array + SPREAD * rng.normal(size=array.shape) for name, array in found.items()}
+        found |= {name: found[name] + ON for name in found if name.endswith("biases_0") and not name.startswith(MIX)}
         return {**found, **memory_of(rng)}
 
-    extend = partial(as_anchors, voxel=VOXEL, children=CHILDREN, latent=LATENT)
+    def extend(gaussians: Gaussians, own: np.random.Generator) -> Anchors:
+        found = as_anchors(gaussians, own, voxel=VOXEL, children=CHILDREN, latent=LATENT)
+        rows = np.unique(np.linspace(0, len(found.means) - 1, N_ANCHORS).astype(int))
+        return take(found._replace(log_scales=found.log_scales + np.log(WIDER)), rows)
+
     return ANCHORS._replace(extend=extend, shared=shared, rates=Rates({"sh_rest": 0.0}, frozenset()))
 
 
@@ -100,31 +134,78 @@ def _sides(model: Model, view: View, *, with_queries: bool = False) -> tuple[Any
     return tuple(inputs[1] > 0 for inputs in tapes.values())
 
 
-def _queries_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
+class _Movable(NamedTuple):
+    """A small model, and what of it is differentiated."""
+
+    model: Model
+    view: View
+    inputs: dict[str, Floats]
+
+    def at(self, args: tuple[Floats, ...]) -> Model:
+        """Return the model with other inputs."""
+        fields = self.model.gaussians._asdict()
+        given = {**fields, **self.model.shared, **dict(zip(self.inputs, args, strict=True))}
+        population = self.model.gaussians._make(given[name] for name in fields)
+        return Model(population, {name: given[name] for name in self.model.shared})
+
+
+def _movable(setting: Setting, rng: np.random.Generator, *unread: str) -> _Movable:
+    """Return a model without inputs that are not read: colours, and those that are named."""
     view = training_view(setting.camera)
     model, _ = noisy_model(setting, view, small(rng), rng)
-    unread = {MEMORY, KEYS, ADAPTER, *(name for name in model.shared if name.startswith("color"))}
-    fields = model.gaussians._asdict()
-    inputs = {name: array for name, array in fields.items() if name not in ("sh_dc", "sh_rest")}
-    inputs |= {name: array for name, array in model.shared.items() if name not in unread}
+    everything = {**model.gaussians._asdict(), **model.shared}
+    unread = (*unread, "sh_dc", "sh_rest", *(name for name in model.shared if name.startswith("color")))
+    return _Movable(model, view, {name: array for name, array in everything.items() if name not in unread})
 
-    def draw(args: tuple[Floats, ...], used: Backend) -> tuple[Floats, Any, Model]:
-        given = {**fields, **model.shared, **dict(zip(inputs, args, strict=True))}
-        moved = Model(model.gaussians._make(given[name] for name in fields), {n: given[n] for n in model.shared})
-        request = Request(conventions=setting.conventions, backend=used)
-        return *blended_queries(moved, view, request), moved
+
+def _queries_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
+    movable = _movable(setting, rng, MEMORY, KEYS, ADAPTER)
+
+    def draw(model: Model, used: Backend) -> tuple[Floats, FeatureTape]:
+        return blended_queries(model, movable.view, Request(conventions=setting.conventions, backend=used))
 
     def function(*args: Floats) -> Point:
         on_watch, sides = watch(backend)
-        image, _, moved = draw(args, on_watch)
-        return Point((image,), (*sides, *_sides(moved, view, with_queries=True)))
+        moved = movable.at(args)
+        image, _ = draw(moved, on_watch)
+        return Point((image,), (*sides, *_sides(moved, movable.view, with_queries=True)))
 
     def vjp(v_image: Floats) -> tuple[Floats, ...]:
-        anchors, shared = blended_queries_vjp(draw(tuple(inputs.values()), backend)[1], v_image)
+        anchors, shared = blended_queries_vjp(draw(movable.model, backend)[1], v_image)
         by_name = {**anchors._asdict(), **shared}
-        return tuple(by_name[name] for name in inputs)
+        return tuple(by_name[name] for name in movable.inputs)
 
-    return Stage("blended_queries", inputs, ("queries",), function, vjp)
+    return Stage("blended_queries", movable.inputs, ("queries",), function, vjp)
+
+
+def _loss_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
+    """Return the error of the features that a view reads as a function of everything that is read."""
+    movable = _movable(setting, rng)
+    for name, factor in ((MEMORY, LONG), (KEYS, SHORT)):
+        movable.inputs[name] = movable.model.shared[name][:] = factor * movable.model.shared[name]
+    width, height = setting.camera.width, setting.camera.height
+    drawn = rng.choice(width * height, min(N_PIXELS, width * height), replace=False)
+    pixels = np.stack(np.divmod(drawn, width), axis=1)
+    image, _ = blended_queries(movable.model, movable.view, Request(conventions=setting.conventions))
+    read_there, _ = read_memory(image[pixels[:, 0], pixels[:, 1]], movable.model.shared)
+    wanted = read_there + NEAR * rng.normal(size=read_there.shape)
+
+    def error(model: Model, used: Backend) -> tuple[float, Cotangents]:
+        request = Request(conventions=setting.conventions, backend=used)
+        return error_at_pixels(model, movable.view, request, pixels, wanted)
+
+    def function(*args: Floats) -> Point:
+        on_watch, sides = watch(backend)
+        moved = movable.at(args)
+        value, _ = error(moved, on_watch)
+        return Point((np.asarray(value),), (*sides, *_sides(moved, movable.view, with_queries=True)))
+
+    def vjp(v_error: Floats) -> tuple[Floats, ...]:
+        _, v = error(movable.model, backend)
+        by_name = {**v.gaussians, **v.shared}
+        return tuple(float(v_error) * by_name[name] for name in movable.inputs)
+
+    return Stage("loss term feature_loss", movable.inputs, ("error",), function, vjp)
 
 
 def _reading_stage(rng: np.random.Generator) -> Stage:

@@ -30,7 +30,7 @@ from minisplat_ref.extensions.cus.decoding import decode
 from minisplat_ref.extensions.cus.losses import blended_queries, drawn_pixels, read_memory
 from minisplat_ref.extensions.cus.maps import feature_map
 from minisplat_ref.extensions.cus.method import ANCHORS, CUS, LATENT
-from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, MIX, QUERY, Anchors
+from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, QUERY, Anchors
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.mechanisms.features.blending import blend_channels, blend_channels_vjp
 from minisplat_ref.mechanisms.networks.networks import COMPILED
@@ -131,7 +131,7 @@ def features_of_anchors(model: Model, view: View) -> Floats:
 
 def feature_floats(model: Model) -> int:
     """Return the floats that anchors have for their features: latents, the network of queries and its mixture."""
-    shared = sum(array.size for name, array in model.shared.items() if name.startswith((QUERY, MIX)))
+    shared = sum(array.size for name, array in model.shared.items() if name.startswith(QUERY))
     return int(model.gaussians.latents.size) + shared
 
 
@@ -178,7 +178,8 @@ def counts(model: Model) -> dict[str, int]:
     return {"gaussians": len(g.means) * n_children, "all_floats": floats}
 
 
-def _psnr(model: Model, scene: Scene, recipe: Recipe) -> float | None:
+def psnr_of(model: Model, scene: Scene, recipe: Recipe) -> float | None:
+    """Return the mean PSNR of the held-out views, dB."""
     return evaluate(model, scene.test_views, RenderSettings(scene.background, renderer=recipe.renderer)).psnr
 
 
@@ -198,7 +199,7 @@ def measure(made: SyntheticScene, iterations: int, seed: int) -> list[dict[str, 
             records.append(
                 {
                     "arm": f"{ANCHOR_ARM}, latent {latent}",
-                    "psnr": _psnr(model, task.scene, recipe),
+                    "psnr": psnr_of(model, task.scene, recipe),
                     **counts(model),
                     "floats": feature_floats(model),
                     **quality(task, lambda view, model=model: features_of_anchors(model, view)),  # type: ignore[misc]
@@ -215,7 +216,7 @@ def measure(made: SyntheticScene, iterations: int, seed: int) -> list[dict[str, 
             records.append({"arm": f"{OWN}, {width}", "floats": found["queries"].size, **quality(task, features_of)})
         recipe = find_recipe("adaptive", iterations)
         model = kit.train_with_progress(task.scene, recipe, seed).model
-        records.append({"arm": "adaptive", "psnr": _psnr(model, task.scene, recipe), **counts(model)})
+        records.append({"arm": "adaptive", "psnr": psnr_of(model, task.scene, recipe), **counts(model)})
     return records
 
 
