@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.cuda.arrays import empty
-from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch
+from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, is_simulated, launch
 
-THREADS = 256  # of a block
+THREADS = 32 if is_simulated else 256  # of a block; the simulator has a Python thread for each
 NUMBERS = 8  # of a thread
 BLOCK_NUMBERS = THREADS * NUMBERS
 ONE_BLOCK = 32 * BLOCK_NUMBERS  # numbers up to which one block does it all, which is one launch

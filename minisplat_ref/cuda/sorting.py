@@ -12,11 +12,10 @@ import numpy as np
 
 from minisplat_ref.cuda.arrays import empty
 from minisplat_ref.cuda.scanning import exclusive_sums
-from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch, launch_rows
+from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, is_simulated, launch, launch_rows
 
-DIGIT_BITS = 6
-N_DIGITS = 1 << DIGIT_BITS
-THREADS = 128  # of a block
+DIGIT_BITS, THREADS = (4, 32) if is_simulated else (6, 128)  # of a block; the simulator has a Python thread for each
+N_DIGITS = 1 << DIGIT_BITS  # at most as many as threads
 KEYS = 16  # of a thread
 BLOCK_KEYS = THREADS * KEYS
 
@@ -37,7 +36,7 @@ def digit_of(keys, i, shift):
 
 @device_function
 def count_own(keys, shift, counts):
-    """Count the digits of the thread's keys in its column of ``counts`` [64, threads]; return where they lie."""
+    """Count the digits of the thread's keys in its column of ``counts`` [digits, threads]; return where they lie."""
     thread = cuda.threadIdx.x
     first = cuda.blockIdx.x * BLOCK_KEYS + thread * KEYS
     end = min(first + KEYS, keys.shape[0])
@@ -51,7 +50,7 @@ def count_own(keys, shift, counts):
 
 @gpu_kernel
 def count_digits(keys, shift, totals):
-    """Write how often each digit occurs in one block, to ``totals`` [64 * blocks], digit after digit."""
+    """Write how often each digit occurs in one block, to ``totals`` [digits * blocks], digit after digit."""
     counts = cuda.shared.array((N_DIGITS, THREADS), np.int32)
     count_own(keys, shift, counts)
     digit = cuda.threadIdx.x
@@ -64,7 +63,7 @@ def count_digits(keys, shift, totals):
 
 @gpu_kernel
 def move_keys(keys, values, shift, starts, sorted_keys, sorted_values):
-    """Write the keys of one block and their values to their places, from ``starts`` [64 * blocks + 1] on."""
+    """Write the keys of one block and their values to their places, from ``starts`` [digits * blocks + 1] on."""
     places = cuda.shared.array((N_DIGITS, THREADS), np.int32)
     first, end = count_own(keys, shift, places)
     digit = cuda.threadIdx.x
