@@ -24,8 +24,8 @@
 # that run together, has nothing left to do. A pixel that is finished early waits for its warp, and a warp for its
 # block.
 #
-# There is no GPU here: Numba's simulator runs the kernels as Python threads. On an H200 they gave the same image
-# ([the backend cuda](../docs/INTERNALS.md#the-backend-cuda)).
+# There is no GPU here: Numba's simulator runs the kernels as Python threads. On an H200, images are those of
+# the reference, too ([the backend cuda](../docs/INTERNALS.md#the-backend-cuda)).
 
 # %%
 import os

@@ -1,31 +1,21 @@
 """Trainings whose arrays stay on the device, in Numba's simulator, against the same by the reference."""
 
-import os
-import pickle
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from cuda_simulator import run_in_simulator
 from cuda_training import N_GAUSSIANS, TRAININGS, train_by
 from minisplat_ref.backends import REFERENCE
 from tolerances import CUDA_TRAINING
 
 pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
 
-HELPERS = Path(__file__).parent.parent / "helpers"
 MOST_COPIES = 40  # of an iteration: cameras, lists that the host sorts, sums over tiles
 
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    path = tmp_path_factory.mktemp("cuda") / "results.pickle"
-    places = os.pathsep.join([str(HELPERS), str(HELPERS.parent.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
-    subprocess.run([sys.executable, HELPERS / "cuda_training.py", path], env=environment, check=True)
-    return pickle.loads(path.read_bytes())
+    return run_in_simulator("cuda_training.py", tmp_path_factory.mktemp("cuda") / "results.pickle")
 
 
 @pytest.mark.parametrize("name", TRAININGS)

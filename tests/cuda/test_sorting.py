@@ -1,28 +1,17 @@
 """The scan and the sort of the backend cuda beside NumPy's, in Numba's simulator, with blocks of a few numbers."""
 
-import os
-import pickle
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from cuda_simulator import run_in_simulator
 from cuda_sorting import SCANNED, SORTED, make_counts, make_keys
 
 pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
 
-HELPERS = Path(__file__).parent.parent / "helpers"
-
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    path = tmp_path_factory.mktemp("sorting") / "results.pickle"
-    places = os.pathsep.join([str(HELPERS), str(HELPERS.parent.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
-    subprocess.run([sys.executable, HELPERS / "cuda_sorting.py", path], env=environment, check=True)
-    return pickle.loads(path.read_bytes())
+    return run_in_simulator("cuda_sorting.py", tmp_path_factory.mktemp("sorting") / "results.pickle")
 
 
 @pytest.mark.parametrize("n", SCANNED)

@@ -1,14 +1,9 @@
 """The backend cuda against the reference: the kernels run in Numba's simulator, in a process of its own."""
 
-import os
-import pickle
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from cuda_simulator import run_in_simulator
 from cuda_stages import CASES, LOSSES, run_stages
 from minisplat_ref.backends import REFERENCE
 from tolerances import (
@@ -20,17 +15,11 @@ from tolerances import (
 
 pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
 
-HELPERS = Path(__file__).parent.parent / "helpers"
-
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
     """What the stages return in the simulator, by case, and the gradient of blending in a second run."""
-    path = tmp_path_factory.mktemp("cuda") / "results.pickle"
-    places = os.pathsep.join([str(HELPERS), str(HELPERS.parent.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
-    subprocess.run([sys.executable, HELPERS / "cuda_stages.py", path], env=environment, check=True)
-    return pickle.loads(path.read_bytes())
+    return run_in_simulator("cuda_stages.py", tmp_path_factory.mktemp("cuda") / "results.pickle")
 
 
 def assert_close(found, expected, tolerance, name):
