@@ -602,6 +602,7 @@ TABLES["cus"] = {
         anchor_scale=(0.01, 1),
         prune_insignificant=[steps(2_000, 14_000, 1_000)],
         prune_insignificant__min_gap=100,
+        collect_gradients_of_children__growth_threshold=None,
         grow_anchors__voxel=1.0,
         grow_anchors__growth_threshold=None,
         grow_anchors__min_gap=100,

@@ -34,11 +34,13 @@ THRESHOLD = 2e-4  # tau of the release, that of 3DGS
 SUM, COUNT = "children_gradient_sum", "children_view_count"
 
 
-def collect_gradients_of_children(state: TrainState, iteration: Iteration) -> None:
+def collect_gradients_of_children(state: TrainState, iteration: Iteration, *, growth_threshold: float | None) -> None:
     """Add the positional gradient of each Gaussian to ``stats[SUM]`` [N, K], and count the view in ``stats[COUNT]``.
 
-    A Gaussian without a gradient was not seen.
+    A Gaussian without a gradient was not seen. Where nothing will grow, as there is no threshold, nothing is collected.
     """
+    if growth_threshold is None:
+        return
     n, k = len(state.gaussians.means), state.gaussians.n_children
     if SUM not in state.stats:
         state.stats[SUM] = np.zeros((n, k), iteration.v_means2d.dtype)
@@ -138,9 +140,9 @@ def grow_anchors(
     growth_threshold : float or None
         tau; None: there is no growing.
     """
-    counts, sums = state.stats.pop(COUNT), state.stats.pop(SUM)
     if growth_threshold is None:
         return "nothing done: growth_threshold is none"
+    counts, sums = state.stats.pop(COUNT), state.stats.pop(SUM)
     gradients = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
     first = initial_gaussians(iteration.scene, 0, np.random.default_rng(0))  # draws only where there are no points
     edit = grow(state.gaussians, gradients, voxel_side(first, voxel), growth_threshold, state.rng)

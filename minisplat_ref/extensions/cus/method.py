@@ -163,7 +163,7 @@ CUS = GS_ACCEL._replace(
         LossTerm("anchor_scale", anchor_scale, 0.01),
     ),
     events=(
-        During(collect_gradients_of_children, start=500, stop=15_000),
+        During(partial(collect_gradients_of_children, growth_threshold=None), start=500, stop=15_000),
         # before the growing, as new anchors have no mean gradient yet by which to be judged
         Every(1_000, partial(prune_insignificant, share=0.001), start=1_500, stop=15_000, min_gap=100),
         Every(100, partial(grow_anchors, voxel=1.0, growth_threshold=None), start=1_500, stop=15_000, min_gap=100),
