@@ -193,7 +193,7 @@ def test_a_run_grows(tmp_path, capfd):
     sizes = ["--views", "6", "--width", "48", "--height", "40", "--points", "60", "--supersampling", "1"]
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *sizes]) == 0
     sets = [word for name, value in SMALL.items() for word in ("--set", f"{name}={value}")]
-    words = ["train", str(tmp_path / "room"), "--recipe", "cus", "--iterations", "300", *sets]
+    words = ["train", str(tmp_path / "room"), "--recipe", "cus", "--iterations", "230", *sets]
     assert main([*words, "--set", "growth_threshold=1e-4", "--out", str(tmp_path / "run")]) == 0
     fired = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     grown = [event for event in fired if event["action"] == "grow_anchors"]
@@ -208,7 +208,7 @@ def test_the_study_of_growing_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CUS", configure(find_recipe("cus"), **SMALL))
     monkeypatch.setattr(study, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
     monkeypatch.setattr(growth_study, "LATENT", SMALL["latent"])
-    assert main(["study", "cus/growth", "--iterations", "300", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
+    assert main(["study", "cus/growth", "--iterations", "230", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
     records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
     assert [r["arm"] for r in records] == [
         "90 points, without growing",

@@ -15,7 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.micro.counts import ARMS
+from minisplat_ref.extensions.micro.counts import CURVES
 from minisplat_ref.extensions.micro.method import (
     clone_and_split_by_detail,
     clusters,
@@ -366,10 +366,11 @@ def test_the_study_measures_at_equal_count(tmp_path, capsys):
 
 
 def test_the_study_measures_quality_against_count(scene_folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("minisplat_ref.extensions.micro.counts.ARMS", {k: v[:1] for k, v in ARMS.items()})
+    short = {name: curve._replace(points=curve.points[:1]) for name, curve in CURVES.items()}
+    monkeypatch.setattr("minisplat_ref.extensions.micro.counts.CURVES", short)
     out = tmp_path / "counts"
     options = ["--iterations", "300", "--seeds", "1", "--out", str(out)]
     assert main(["study", "micro/counts", str(scene_folder), *options]) == 0
-    plain, first, both = json.loads((out / "result.json").read_text())["points"]
-    assert both["n_gaussians"][0] < first["n_gaussians"][0] and plain["settings"] == {"threshold": 2e-4}
+    plain, first, both = json.loads((out / "result.json").read_text())["records"]
+    assert both["n_gaussians"] < first["n_gaussians"] and plain["settings"] == {"threshold": 2e-4}
     assert (out / "figure.png").stat().st_size > 10_000 and "| micro, first stage alone | " in capsys.readouterr().out

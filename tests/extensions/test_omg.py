@@ -16,7 +16,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_format, find_recipe
 from minisplat_ref.extensions.omg import file as omg
-from minisplat_ref.extensions.omg import study, trained_file
+from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.appearance import features_of, fit_decoder
 from minisplat_ref.extensions.omg.method import prune_indistinct
 from minisplat_ref.extensions.omg.pack import read_training
@@ -453,12 +453,3 @@ def test_study(folders, tmp_path, capsys):
     assert "textured half" in capsys.readouterr().out
     assert main(more) == 0  # continues: there is nothing left to measure
     assert json.loads((tmp_path / "out" / "result.json").read_text()) == result
-
-
-def test_the_flatter_half_is_half():
-    """This holds for an image whose right half is a ramp, and for one that is flat everywhere."""
-    pixels = np.zeros((4, 8, 3), np.uint8)
-    pixels[:, 4:] = 20 * np.arange(1, 5)[None, :, None]
-    assert_array_equal(study.flatter_half(pixels)[:, :3], True)
-    assert_array_equal(study.flatter_half(pixels)[:, 5:], False)
-    assert np.count_nonzero(study.flatter_half(np.zeros((4, 8, 3)))) == 16

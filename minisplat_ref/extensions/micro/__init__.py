@@ -33,7 +33,7 @@ out is LPIPS in the loss, whose weights are not ours to ship.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.micro.method import MICRO
 from minisplat_ref.extensions.micro.stages import stages
-from minisplat_ref.studies.study import OUT, argument, declare, downscale, iterations, scene, seeds
+from minisplat_ref.studies.study import OUT, RESUMED_OUT, argument, declare, downscale, iterations, scene, seeds
 
 CHECKER = declare(
     "checker",
@@ -47,6 +47,6 @@ COUNTS = declare(
     "counts",
     "quality against the number of Gaussians, with the second stage and without",
     f"{__name__}.counts.run",
-    *(scene(), OUT, downscale(), iterations(2000), seeds(3)),
+    *(scene(), RESUMED_OUT, downscale(), iterations(2000), seeds(3)),
 )
 EXTENSION = Extension("micro", recipes=(MICRO,), stages=stages, studies=(CHECKER, COUNTS))

@@ -6,12 +6,12 @@ number of iterations, without any event. Then each is written as ``.omg`` and re
 field by itself is taken from such a file at every level, which shows where the quality is lost.
 
 Distinctiveness hurts flat regions, because these consist of Gaussians whose neighbours have the same colour. So the
-study splits the pixels of each test photograph by their gradient into the flatter half and the rest.
+study measures the flatter half of each test photograph and the rest apart (:mod:`minisplat_ref.studies.detail`).
 """
 
 import argparse
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,32 +21,21 @@ from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.metrics import ViewMetrics, evaluate, psnr
-from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import intersection_preserving, most_important
 from minisplat_ref.studies import kit
+from minisplat_ref.studies.detail import Quality, quality
 from minisplat_ref.studies.figures import plot_deviations, set_ticks, with_deviation
-from minisplat_ref.types import Bools, Floats, Gaussians, Scene, View
+from minisplat_ref.types import Gaussians, Scene
 
 FRACTIONS = (0.5, 0.25, 0.125)
 FINE_TUNING = "3dgs"  # the recipe whose learning rates are used, from the first to the last
 CHOICES = {"importance": 0.0, "with distinctiveness": POWER}
 """The selections, with the power of distinctiveness in their score."""
 COLORS = dict(zip(CHOICES, (BLUE, RED), strict=True))
-
-
-class Quality(NamedTuple):
-    """Agreement with the test views, dB."""
-
-    psnr: float
-    flat: float
-    """Over the flatter half of the pixels of each view."""
-    textured: float
-    """Over the other half."""
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -119,29 +108,6 @@ def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float
         for field, of_levels in losses.items():
             of_levels.append(before - quality(whole._replace(**{field: getattr(back, field)}), scene).psnr)
     return losses
-
-
-def quality(gaussians: Gaussians, scene: Scene) -> Quality:
-    """Return the mean PSNR over the test views of all pixels, of the flatter half of each view, and of the rest."""
-    found = []
-
-    def on_view(view: View, image: Floats, metrics: ViewMetrics) -> None:
-        pixels = view.load().image
-        is_flat = flatter_half(pixels)
-        clipped = np.clip(image, 0, 1)
-        found.append((metrics.psnr, psnr(clipped, pixels, is_flat), psnr(clipped, pixels, ~is_flat)))
-
-    evaluate(gaussians, scene.test_views, RenderSettings(scene.background), on_view=on_view)
-    return Quality(*np.mean(found, axis=0).tolist())
-
-
-def flatter_half(pixels: Any) -> Bools:
-    """Return [H, W], True for the half of the pixels with the smaller gradient of the mean of the channels."""
-    dy, dx = np.gradient(np.asarray(pixels, np.float64).mean(axis=2))
-    ascending = np.argsort(np.hypot(dx, dy), axis=None, kind="stable")
-    is_flat = np.zeros(dx.shape, bool)
-    is_flat.flat[ascending[: dx.size // 2]] = True
-    return is_flat
 
 
 COLUMNS: dict[str, tuple[Callable[[dict[str, Any]], float], int]] = {
