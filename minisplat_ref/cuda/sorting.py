@@ -94,10 +94,10 @@ def sort_by_key(keys: Any, values: Any, n_bits: int) -> tuple[Any, Any]:
     Parameters
     ----------
     keys : device array of shape (M,) of int32 or int64
-        Not negative. They and ``values`` are overwritten.
+        Sorted as if they were unsigned. They and ``values`` are overwritten.
     values : device array of shape (M,) of int32
     n_bits : int
-        Every key is below 2 to the power of it.
+        Every key, unsigned, is below 2 to the power of it.
 
     Returns
     -------

@@ -99,16 +99,24 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
 
 
 def order_by_depth(depths: Any) -> Any:
-    """Return the order [N] of Gaussians by depth; positive floats are ordered as their bits are as integers."""
+    """Return the order [N] of Gaussians by depth, which may be negative."""
     n_bits = 8 * depths.dtype.itemsize
-    keys = empty(len(depths), np.int32 if n_bits == 32 else np.int64)
-    launch_rows(copy_numbers, len(depths), to_device(depths.view(keys.dtype)), keys)
+    dtype = np.int32 if n_bits == 32 else np.int64
+    keys = empty(len(depths), dtype)
+    launch_rows(write_keys, len(depths), to_device(depths.view(dtype)), dtype(np.iinfo(dtype).min), keys)
     return sort_by_key(keys, order_of(len(depths)), n_bits)[1]
 
 
 @gpu_kernel
-def copy_numbers(numbers, out):
-    """Copy numbers, which a sort overwrites."""
+def write_keys(bits, sign, keys):
+    """Write integers whose order, unsigned, is that of the floats with these bits; both zeros are equal.
+
+    Positive floats are ordered as their bits, negative ones the opposite way. With the sign flipped, the former come
+    after the latter.
+    """
     i = cuda.grid(1)
-    if i < out.shape[0]:
-        out[i] = numbers[i]
+    if i < keys.shape[0]:
+        key = bits[i]
+        if key < 0:
+            key = sign - key
+        keys[i] = key ^ sign

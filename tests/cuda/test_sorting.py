@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cuda_simulator import run_in_simulator
-from cuda_sorting import SCANNED, SORTED, make_counts, make_keys
+from cuda_sorting import DEPTHS, SCANNED, SORTED, make_counts, make_keys
 
 pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
 
@@ -27,3 +27,9 @@ def test_equal_keys_keep_their_order(dtype, n, simulated):
     np.testing.assert_array_equal(found_keys, keys[order])
     np.testing.assert_array_equal(found_order, order)
     assert (found_keys.dtype, found_order.dtype) == (dtype, np.int32)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_negative_depths_are_nearer_than_positive_ones(dtype, simulated):
+    """As altitudes are, which a camera above takes for depths; zeros of both signs are the same depth."""
+    assert simulated[2][dtype].tolist() == np.argsort(DEPTHS, kind="stable").tolist() == [4, 1, 8, 6, 3, 5, 7, 0, 9, 2]

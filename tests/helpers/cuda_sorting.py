@@ -8,6 +8,7 @@ import numpy as np
 
 SCANNED = (1, 16, 17, 150)  # numbers; up to 16 one block does all, and of 150 the blocks' sums need several
 SORTED = (1, 9, 40)  # keys; a block has 8
+DEPTHS = (0.5, -2.0, 1e30, -0.0, -1e30, 0.0, -1e-30, 1e-30, -1.0, 3.0)
 BITS = {np.int32: 9, np.int64: 36}
 
 
@@ -24,7 +25,8 @@ def make_keys(n, dtype):
 
 def main(path):
     """Write what the kernels return to a file."""
-    from minisplat_ref.cuda import scanning, sorting
+    from minisplat_ref.cuda import scanning, sorting, tiling
+    from minisplat_ref.cuda.arrays import to_host
     from minisplat_ref.cuda.target import cuda
 
     scanning.THREADS, scanning.NUMBERS, scanning.BLOCK_NUMBERS, scanning.ONE_BLOCK = 4, 2, 8, 16
@@ -36,7 +38,8 @@ def main(path):
             keys = cuda.to_device(make_keys(n, dtype))
             pair = sorting.sort_by_key(keys, sorting.order_of(n), n_bits)
             found[dtype.__name__, n] = tuple(array.copy_to_host() for array in pair)
-    Path(path).write_bytes(pickle.dumps((sums, found)))
+    orders = {t.__name__: to_host(tiling.order_by_depth(np.array(DEPTHS, t))) for t in (np.float32, np.float64)}
+    Path(path).write_bytes(pickle.dumps((sums, found, orders)))
 
 
 if __name__ == "__main__":

@@ -95,6 +95,17 @@ def test_equal_depths_keep_the_order_of_the_rows(backend):
     assert lists(bins) == [[1, 3, 0, 2]]
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_negative_depths_are_nearer_than_positive_ones(backend, dtype):
+    """As altitudes are, which a camera above takes for depths; zeros of both signs are the same depth."""
+    depths = [0.5, -2.0, 1e30, -0.0, -1e30, 0.0, -1e-30, 1e-30, -1.0, 3.0]
+    grid = TileGrid(4, 4, backend.tile_width, backend.tile_height)
+    p = footprints([[0, 0, 4, 4]] * 10, depths)
+    projection = Projection(*(f.astype(dtype) for f in p[:2]), p.conics, p.opacities.astype(dtype), *p[4:])
+    bins = backend.bin_gaussians(projection, grid, GSPLAT_MAIN)
+    assert lists(bins) == [[4, 1, 8, 6, 3, 5, 7, 0, 9, 2]]
+
+
 def test_pairs_are_findable_from_their_gaussian(backend, rng):
     projection = REFERENCE.project(*activated(make_gaussians(rng, 60)), make_camera(50, 40, fx=50, fy=60), GSPLAT_MAIN)
     bins = backend.bin_gaussians(projection, TileGrid(50, 40, backend.tile_width, backend.tile_height), GSPLAT_MAIN)
@@ -186,7 +197,7 @@ def test_fast_lists_over_many_tiles(fast_backend, dtype, rng):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("spread", ["three", "one", "neighbours", "wide"])
+@pytest.mark.parametrize("spread", ["three", "one", "neighbours", "wide", "altitudes", "signs"])
 def test_order_of_any_depths(fast_backend, dtype, spread, rng):
     n = 400
     depths = {
@@ -194,6 +205,8 @@ def test_order_of_any_depths(fast_backend, dtype, spread, rng):
         "one": np.full(n, 3.0),
         "neighbours": dtype(3) + np.spacing(dtype(3)) * rng.integers(0, 50, n),  # float64: alike as float32
         "wide": 10.0 ** rng.uniform(-30, 30, n),
+        "altitudes": -rng.uniform(1, 40, n),
+        "signs": 10.0 ** rng.uniform(-30, 30, n) * rng.choice([-1, 1], n),
     }[spread]
     projection = random_footprints(rng, n, dtype, depths=depths)
     grid = TileGrid(300, 200, fast_backend.tile_width, fast_backend.tile_height)

@@ -31,10 +31,11 @@ from minisplat_ref.cpu.tiling.layers import (
     start_lists,
     survey_part,
 )
+from minisplat_ref.cpu.tiling.sorting import keys_of
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
-from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
+from minisplat_ref.types import Projection, TileBins, TileGrid
 
 __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
 
@@ -82,7 +83,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     within one row or one column of tiles is not examined that closely.
     """
     n, n_tiles, dtype = len(projection.depths), grid.n_tiles_x * grid.n_tiles_y, projection.depths.dtype
-    keys: Ints = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
+    keys = keys_of(projection.depths)
     screen = Screen(grid.n_tiles_x, n_tiles, dtype.type(conventions.alpha_min))
     survey = Survey(
         keys,

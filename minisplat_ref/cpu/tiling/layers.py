@@ -41,7 +41,7 @@ class Survey(NamedTuple):
     """Results of the first pass for each part, and the depths as integers."""
 
     keys: Ints
-    """[N] bits of the depths: positive floats are ordered as their bits are."""
+    """[N] integers in the order of the depths, :func:`~minisplat_ref.cpu.tiling.sorting.keys_of`."""
 
     up_to: Ints
     """[N_PARTS, CULLED + 2] Gaussians of each part below each bucket, and 2^32 times the tiles under their boxes, so
