@@ -41,7 +41,7 @@ BOXES = declare(
     "boxes",
     "heights, shadows and colours of boxes without each part",
     f"{__name__}.claims.run_boxes",
-    *(RESUMED_OUT, seeds(3), iterations(700)),
+    *(RESUMED_OUT, seeds(3), iterations(2_000)),
 )
 DISTANCE = declare("distance", "from where affine cameras fit perspective ones", f"{__name__}.claims.run_distance", OUT)
 EXTENSION = Extension(

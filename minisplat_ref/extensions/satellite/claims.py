@@ -33,6 +33,7 @@ ARMS = (
     "limits 8 m below the ground",
 )
 PLANE, BELOW = "a plane", 8.0  # metres
+N_POINTS = 10_000
 _TERMS = {ARMS[3]: "opacity_sparsity", ARMS[4]: "view_consistency", ARMS[5]: "shadow_entropy"}
 DISTANCES, OFF_NADIR = (500e3, 50e3, 5e3), (0.0, 25.0)  # metres, degrees
 GSD, SPAN, HEIGHT = 0.3, 500.0, 100.0  # metres
@@ -90,7 +91,7 @@ def run_boxes(args: argparse.Namespace) -> kit.Report:
     jobs = [{"seed": seed, "arm": arm} for seed in range(args.seeds) for arm in ARMS]
 
     def measure_job(seed: int, arm: str) -> list[dict[str, Any]]:
-        truth = make_scene(seed, below=BELOW if arm == ARMS[-1] else 0.0)
+        truth = make_scene(seed, N_POINTS, below=BELOW if arm == ARMS[-1] else 0.0)
         recipe, scene = arm_of(arm, find_recipe("satellite", args.iterations), truth.scene)
         # Photographs without a sun in their cameras have no shadows; the truth's masks still do.
         measured, heights = measure(train(scene, recipe, seed=seed).model, truth._replace(scene=scene))
