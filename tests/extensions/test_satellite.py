@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -19,6 +20,8 @@ from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Camera, Model, Optics, view_from
+from scenes import as_dtype
+from tolerances import PARITY_FLOAT64
 
 EXACT = 1e-12  # float64, a few operations
 FINE = 1e-8  # central differences of step 1e-5 on values near 1
@@ -436,3 +439,18 @@ def test_limits_below_the_ground():
 def test_representation():
     assert SEEN_FROM_ABOVE.takes_optics
     assert isinstance(boxes.zenith(), Camera)
+
+
+def test_backends_agree_on_what_is_highest(rng):
+    """Altitudes are negative depths; of what fills a volume and is opaque, a camera sees the top."""
+    truth = boxes.make_scene(0, n_points=400, size=16)
+    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
+    g = state.gaussians._replace(opacity_logits=np.full(400, 3.0), log_scales=state.gaussians.log_scales + 0.5)
+    wants = frozenset({"albedo", "altitude", "shadow"})
+    images = []
+    for backend in (REFERENCE, CPU):
+        request = Request(backend=backend, wants=wants)
+        model = Model(as_dtype(g, np.float64), state.shared)
+        images.append(SATELLITE.render(model, truth.scene.train_views[1], request)[0].image)
+    assert_allclose(images[1], images[0], atol=PARITY_FLOAT64)
+    assert np.median(images[0][..., 6]) > 0.7 * boxes.HIGH
