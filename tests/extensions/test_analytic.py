@@ -14,7 +14,6 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.analytic import footprint
 from minisplat_ref.extensions.analytic.method import INTEGRATED
 from minisplat_ref.extensions.analytic.reference import (
@@ -241,16 +240,24 @@ def test_a_thin_needle_misses_no_tile(rng):
     assert SPLATTING.render(Model(needle), view, bare)[0].alpha.max() == 0
 
 
-def test_no_gaussians_and_no_statistics(backend, rng):
-    none = as_dtype(make_gaussians(rng, 0), np.float32)
+def test_without_gaussians_nothing_is_drawn(backend):
+    none = as_dtype(make_gaussians(np.random.default_rng(0), 0), np.float32)
     assert DRAW.render(Model(none), view_from(make_camera()), Request(backend=backend))[0].image.max() == 0
-    some, asks = as_dtype(make_gaussians(rng, 5), np.float32), frozenset({"stats"})
-    if backend.is_compiled:
-        with pytest.raises(InputError, match="--backend reference"):
-            DRAW.render(Model(some), view_from(make_camera()), Request(backend=backend, wants=asks))
-    else:
-        output, _ = DRAW.render(Model(some), view_from(make_camera()), Request(backend=backend, wants=asks))
-        assert output.stats.hit_count.sum() > 0
+
+
+def test_statistics_are_those_of_integrals(backend, rng):
+    """Both backends agree, and a removal changes what the image lacks without the Gaussian."""
+    g, view = make_gaussians(rng, 12, opacity_logit=1.0), view_from(make_camera(rng=rng))
+    wants = frozenset({"stats", "median_depth", "removal_changes"})
+    output, expected = (DRAW.render(Model(g), view, Request(backend=b, wants=wants))[0] for b in (backend, REFERENCE))
+    for found, statistic in zip(output.stats, expected.stats, strict=True):
+        assert_allclose(found, statistic, rtol=1e-9, atol=PARITY_FLOAT64)
+    assert_allclose(output.median_depth, expected.median_depth, atol=PARITY_FLOAT64)
+    changes = output.extras["removal_changes"]
+    n = int(np.argmax(changes))
+    without, _ = DRAW.render(Model(g), view, Request(backend=backend, is_visible=np.arange(12) != n))
+    assert_allclose(changes[n], np.sum((output.image - without.image) ** 2), rtol=1e-9)
+    assert changes[n] > 0.1 and output.stats.hit_count.sum() > 100
 
 
 # --- from end to end ---

@@ -244,9 +244,35 @@ def test_what_surfels_do_not_have_is_refused(rng):
     model, view = Model(make_gaussians(rng, 3)), view_from(make_camera(rng=rng))
     with pytest.raises(InputError, match="without surface: train a recipe"):
         SURFELS.render(model, view, Request(wants=frozenset({"surface"})))
-    with pytest.raises(InputError, match="without stats: use --backend reference"):
-        SURFELS.render(model, view, Request(wants=frozenset({"stats"})))
+    with pytest.raises(InputError, match="those of colours alone"):
+        SURFELS.render(model, view, Request(wants=frozenset({"removal_changes", "normal"})))
     with pytest.raises(InputError, match="leave the antialiased profile out"):
         SURFELS.render(model, view, Request(conventions=GSPLAT_MAIN._replace(is_antialiased=True)))
-    output, _ = SURFELS.render(model, view, Request(wants=frozenset({"stats"}), backend=REFERENCE))
-    assert output.stats.hit_count.sum() > 0
+
+
+def test_statistics_are_those_of_the_reference(rng):
+    g = make_gaussians(rng, 30, opacity_logit=1.0)
+    view, wants = view_from(make_camera(rng=rng)), frozenset({"stats", "removal_changes"})
+    of_kernels, expected = (
+        SURFELS.render(Model(g), view, Request(backend=b, wants=wants))[0] for b in (CPU, REFERENCE)
+    )
+    for found, statistic in zip(of_kernels.stats, expected.stats, strict=True):
+        assert_allclose(found, statistic, rtol=SURFEL_WIDE, atol=1e-12)
+    changes = of_kernels.extras["removal_changes"]
+    assert_allclose(changes, expected.extras["removal_changes"], rtol=SURFEL_WIDE, atol=1e-12)
+    assert expected.stats.hit_count.sum() > 100
+
+
+def test_what_a_removal_changes_is_what_is_missing_without_it(backend, rng):
+    """The sum of squared differences between the image and one without the surfel, in front of a light."""
+    g = make_gaussians(rng, 12, opacity_logit=1.0)
+    camera = make_camera(rng=rng)
+    behind = rng.uniform(size=(camera.height, camera.width, 3))
+    request = Request(backend=backend, wants=frozenset({"removal_changes"}), behind=behind)
+    output, _ = SURFELS.render(Model(g), view_from(camera), request)
+    changes = output.extras["removal_changes"]
+    n = int(np.argmax(changes))
+    without, _ = SURFELS.render(Model(g), view_from(camera), Request(backend=backend, is_visible=np.arange(12) != n))
+    lit, dark = (image.image + (1 - image.alpha[..., None]) * behind for image in (output, without))
+    assert_allclose(changes[n], np.sum((lit - dark) ** 2), rtol=1e-9)
+    assert changes[n] > 0.1

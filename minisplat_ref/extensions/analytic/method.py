@@ -7,11 +7,11 @@ from typing import Any
 from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
-from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.analytic.kernels import response_for
 from minisplat_ref.extensions.analytic.reference import RESPONSE
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
+from minisplat_ref.reference.removal import removal_changes_of_hits
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import CompositeGradient, Floats, Model, Projection, RenderOutput, TileBins, View
@@ -27,16 +27,18 @@ def composite(
     with_stats: bool = False,
     with_median_depth: bool = False,
 ) -> RenderOutput:
-    """Blend integrals with the plain kernels; arguments and result are those of ``reference.compositing.composite``.
-
-    Raises
-    ------
-    InputError
-        Statistics are requested, which the plain kernels do not collect.
-    """
-    if with_stats or with_median_depth:
-        raise InputError("the kernels of analytic collect no statistics: use --backend reference")
-    return kernel_hits.composite_hits(response_for(colors.dtype), projection, colors, background, bins, conventions)
+    """Blend integrals with the plain kernels; arguments and result are those of ``reference.compositing.composite``."""
+    response = response_for(colors.dtype)
+    return kernel_hits.composite_hits(
+        response,
+        projection,
+        colors,
+        background,
+        bins,
+        conventions,
+        with_stats=with_stats,
+        with_median_depth=with_median_depth,
+    )
 
 
 def composite_vjp(
@@ -73,6 +75,14 @@ def reference_composite_vjp(
     return CompositeGradient(v_means2d, v_conics, v_opacities, v.colors, v.background)
 
 
+def removal_changes(
+    projection: Projection, colors: Floats, bins: TileBins, conventions: Conventions, output: RenderOutput
+) -> Floats:
+    """Return the squared change of the image without each Gaussian; see ``reference.removal.removal_changes``."""
+    response = response_for(colors.dtype)
+    return kernel_hits.removal_changes_of_hits(response, projection, colors, bins, conventions, output)
+
+
 def with_pixel_integrals(backend: Backend) -> Backend:
     """Return the backend with integrals over pixels instead of samples at their centres.
 
@@ -86,9 +96,14 @@ def with_pixel_integrals(backend: Backend) -> Backend:
             bin_gaussians=REFERENCE.bin_gaussians,
             composite=composite,
             composite_vjp=composite_vjp,
+            removal_changes=removal_changes,
         )
     return replace(
-        backend, name=name, composite=partial(composite_hits, RESPONSE), composite_vjp=reference_composite_vjp
+        backend,
+        name=name,
+        composite=partial(composite_hits, RESPONSE),
+        composite_vjp=reference_composite_vjp,
+        removal_changes=partial(removal_changes_of_hits, RESPONSE),
     )
 
 

@@ -21,6 +21,7 @@ from minisplat_ref.mechanisms.surfels.projection import (
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
+from minisplat_ref.reference.removal import removal_changes_of_hits
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, choose_degree, parameters_vjp
 from minisplat_ref.types import (
     BlendGradient,
@@ -37,7 +38,7 @@ from minisplat_ref.types import (
 
 CHANNELS = {"depth": 1, "normal": 3, "spread": 2, "median": 1}
 """The channels beside ``rgb`` in their order, and how many each has. The median is the last: it is not blended."""
-STATISTICS = frozenset({"stats"})  # by the reference alone
+EXTRAS = frozenset({"stats", "median_depth", "removal_changes"})  # what the output has besides its image
 
 
 class Shown(NamedTuple):
@@ -54,11 +55,20 @@ class Shown(NamedTuple):
     layout: Layout
 
     def blend(self, with_stats: bool = False) -> RenderOutput:
-        """Return the image, blended by kernels or by the reference, which also collects blend statistics."""
+        """Return the image, blended by kernels or by the reference, and blend statistics if asked for."""
         inputs = self.surfels, self.colors, self.background, self.bins, self.conventions
         if self.backend.is_compiled:
-            return kernel_hits.composite_hits(response_for(self.colors.dtype, self.surfels, self.layout), *inputs)
+            response = response_for(self.colors.dtype, self.surfels, self.layout)
+            return kernel_hits.composite_hits(response, *inputs, with_stats=with_stats)
         return composite_hits(surfel_response(self.layout), *inputs, with_stats=with_stats)
+
+    def removal_changes(self, output: RenderOutput) -> Floats:
+        """Return the squared change of the colours [N] without each surfel."""
+        inputs = self.surfels, self.colors, self.bins, self.conventions, output
+        if self.backend.is_compiled:
+            response = response_for(self.colors.dtype, self.surfels, self.layout)
+            return kernel_hits.removal_changes_of_hits(response, *inputs)
+        return removal_changes_of_hits(surfel_response(self.layout), *inputs)
 
     def blend_vjp(self, output: RenderOutput, v_image: Floats, v_alpha: Floats) -> BlendGradient:
         """Gradient of :meth:`blend`."""
@@ -146,10 +156,9 @@ def look(model: Model, view: View, request: Request) -> Seen:
     InputError
         Something is wanted that surfels do not have, or the conventions ask for compensated opacities.
     """
-    known = CHANNELS.keys() | {"median_depth"} | (frozenset() if request.backend.is_compiled else STATISTICS)
-    if missing := request.wants - known:
-        way_out = "use --backend reference" if missing <= STATISTICS else "train a recipe that does without"
-        raise InputError(f"surfels are drawn without {', '.join(sorted(missing))}: {way_out}")
+    if missing := request.wants - CHANNELS.keys() - EXTRAS:
+        names = ", ".join(sorted(missing))
+        raise InputError(f"surfels are drawn without {names}: train a recipe that does without")
     if request.conventions.is_antialiased:
         raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
     primitives = activate(model.gaussians, request.is_visible)
@@ -176,8 +185,15 @@ def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tupl
     output : RenderOutput
         Its image has the channels of :func:`channels`, and then the K that are carried, over a background of 0.
     tape : BlendTape
+
+    Raises
+    ------
+    InputError
+        ``removal_changes`` are wanted of more than colours: other channels have other units.
     """
     surfels, backend, dtype, slices = seen.surfels, request.backend, colors.dtype, channels(request.wants)
+    if "removal_changes" in request.wants and (len(slices) > 1 or carried.shape[1]):
+        raise InputError("removal_changes are those of colours alone: train a recipe that draws colours")
     parts = {"rgb": colors}
     for name in slices:
         if name not in ("rgb", "median"):
@@ -195,8 +211,15 @@ def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tupl
     if measures is not None and "median" in slices:
         at = slices["median"].start
         image = np.concatenate([image[:, :, :at], measures.median[:, :, None].astype(dtype), image[:, :, at:]], axis=2)
+    extras = {}
+    if "removal_changes" in request.wants:
+        lit = blended
+        if request.behind is not None:
+            lit = blended._replace(image=image + (1 - blended.alpha[..., None]) * request.behind)
+        extras["removal_changes"] = shown.removal_changes(lit)
     output = blended._replace(
         image=image,
+        extras=extras,
         median_depth=None if measures is None else measures.median.astype(dtype),
         visible_ids=np.flatnonzero(surfels.radii[:, 0] > 0),
         n_pairs=len(bins.gaussian_ids),
@@ -239,7 +262,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Su
         Wants: ``depth``, ``sum w z`` with the depths of the hits; ``normal``, ``sum w n`` in the camera's frame,
         towards the camera; ``spread``, ``sum w q`` and ``sum w q^2`` of
         :class:`~minisplat_ref.mechanisms.surfels.response.Layout`; ``median``, the median depth as a channel with a
-        gradient; ``median_depth``, the same in the output.
+        gradient; ``median_depth``, the same in the output; ``stats`` and ``removal_changes`` of :class:`Request`.
 
     Returns
     -------
