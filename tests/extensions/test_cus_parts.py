@@ -97,7 +97,7 @@ def test_the_recipe_by_its_numbers():
     assert firing_steps(recipe, prune_insignificant) == list(range(2_000, 15_000, 1_000))
     settings = settings_of(recipe)
     expected = {"children": 10, "latent": 32, "hidden": 32, "embedding": 32, "query": 15, "similarity": 0.9}
-    expected |= {"voxel": 1.0, "share": 0.001, "samples": 2_048, "growth_threshold": None}
+    expected |= {"voxel": 1.0, "share": 0.001, "samples": 2_048, "growth_threshold": 2e-4}
     assert {name: settings[name] for name in expected} == expected
     assert len(firing_steps(recipe, grow_anchors)) == 134 and recipe.sh_degree == 0
     first, last = recipe.rates.at(1, 2.0), recipe.rates.at(30_000, 2.0)

@@ -590,7 +590,9 @@ TABLES["cus"] = {
     **rows(
         "Scaffold-GS, released code: between 500 and 15,000 gradients are collected, from 1,500 on anchors grow",
         collect_gradients_of_children=[steps(501, 14_999, 1)],
+        collect_gradients_of_children__growth_threshold=2e-4,
         grow_anchors=[steps(1_600, 14_900, 100)],
+        grow_anchors__growth_threshold=2e-4,
     ),
     **rows(
         f"{OURS}: voxels as large as the points are apart; what is not trained; weights, rates and dates",
@@ -602,9 +604,7 @@ TABLES["cus"] = {
         anchor_scale=(0.01, 1),
         prune_insignificant=[steps(2_000, 14_000, 1_000)],
         prune_insignificant__min_gap=100,
-        collect_gradients_of_children__growth_threshold=None,
         grow_anchors__voxel=1.0,
-        grow_anchors__growth_threshold=None,
         grow_anchors__min_gap=100,
         rate__latents=2e-2,
         rate__offsets=(1.6e-4, 1.6e-6, 30_000),

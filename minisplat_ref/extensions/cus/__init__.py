@@ -17,12 +17,11 @@ The loss is that of 3DGS, with 0.1 (L2 + 1 - cos) of the features and 0.01 times
     S = 2 |z| + 8 |dL/dz| + sum_n hits_n o_n V_n
 
 Anchors are those of Scaffold-GS (Lu et al. 2023, arXiv 2312.00109), whose rule by which they grow is here, too
-(:mod:`.growth`). It is off unless a threshold is given: from many points it adds floats and hardly any quality, from
-few it helps.
+(:mod:`.growth`). With ``growth_threshold=none`` they do not grow.
 
     minisplat-ref train SCENE --recipe cus --out runs/anchors
     minisplat-ref train SCENE --recipe cus --set features=DIR --out runs/anchors
-    minisplat-ref train SCENE --recipe cus --set growth_threshold=2e-4 --out runs/anchors
+    minisplat-ref train SCENE --recipe cus --set growth_threshold=none --out runs/anchors
     minisplat-ref cus features runs/anchors --out maps
     minisplat-ref study cus/floats --out DIR
     minisplat-ref study cus/growth --out DIR

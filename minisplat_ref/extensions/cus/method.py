@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.cus.decoding import Decoded, decode, decode_vjp
-from minisplat_ref.extensions.cus.growth import collect_gradients_of_children, grow_anchors
+from minisplat_ref.extensions.cus.growth import THRESHOLD, collect_gradients_of_children, grow_anchors
 from minisplat_ref.extensions.cus.losses import anchor_scale, feature_loss
 from minisplat_ref.extensions.cus.population import ANCHOR_RATES, FIXED, UNITS, Anchors, as_anchors, initial_shared
 from minisplat_ref.mechanisms.networks.networks import networks_for
@@ -163,10 +163,10 @@ CUS = GS_ACCEL._replace(
         LossTerm("anchor_scale", anchor_scale, 0.01),
     ),
     events=(
-        During(partial(collect_gradients_of_children, growth_threshold=None), start=500, stop=15_000),
+        During(partial(collect_gradients_of_children, growth_threshold=THRESHOLD), start=500, stop=15_000),
         # before the growing, as new anchors have no mean gradient yet by which to be judged
         Every(1_000, partial(prune_insignificant, share=0.001), start=1_500, stop=15_000, min_gap=100),
-        Every(100, partial(grow_anchors, voxel=1.0, growth_threshold=None), start=1_500, stop=15_000, min_gap=100),
+        Every(100, partial(grow_anchors, voxel=1.0, growth_threshold=THRESHOLD), start=1_500, stop=15_000, min_gap=100),
     ),
 )
 """``cus``: anchors with networks, and the features of the photographs."""

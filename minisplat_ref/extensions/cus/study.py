@@ -106,8 +106,9 @@ def make_task(made: SyntheticScene, seed: int, folder: Path) -> Task:
 
 
 def recipe_of(latent: int, iterations: int, folder: str) -> Recipe:
-    """Return the recipe with latents of this width and the maps of a folder."""
-    recipe = configure(CUS._replace(representation=ANCHORS), latent=latent, features=folder)
+    """Return the recipe with latents of this width and the maps of a folder; anchors stay as many as they are."""
+    still = CUS._replace(representation=ANCHORS)
+    recipe = configure(still, latent=latent, features=folder, growth_threshold=None)
     return scale_recipe(recipe, iterations)
 
 
