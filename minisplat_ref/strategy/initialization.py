@@ -3,7 +3,7 @@
 Left out: the mean distance that the paper states; the released code takes the root mean square, and so do we.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,13 @@ SQUARED_DISTANCE_MIN = 1e-7  # world units^2; points in the same place would get
 INITIAL_OPACITY = 0.1
 N_RANDOM_POINTS = 100_000  # as 3DGS draws for scenes without points
 
+IsInside = Callable[[Floats, Camera], Bools]
+"""``is_inside(points, camera)``: [P] whether points [P, 3] of the world are inside of the camera's image."""
 
-def initial_gaussians(scene: Scene, sh_degree: int, rng: np.random.Generator) -> Gaussians:
+
+def initial_gaussians(
+    scene: Scene, sh_degree: int, rng: np.random.Generator, is_inside: IsInside | None = None
+) -> Gaussians:
     """Return Gaussians at the scene's points, or at random ones if it has too few to measure distances.
 
     Parameters
@@ -30,6 +35,8 @@ def initial_gaussians(scene: Scene, sh_degree: int, rng: np.random.Generator) ->
         Stored degree; coefficients above degree 0 start at zero.
     rng : numpy.random.Generator
         Draws the random points; untouched when the scene has points.
+    is_inside : callable, optional
+        As for :func:`random_points`.
 
     Returns
     -------
@@ -39,7 +46,7 @@ def initial_gaussians(scene: Scene, sh_degree: int, rng: np.random.Generator) ->
     if len(scene.points) > N_NEIGHBOURS:
         return from_points(scene.points, scene.point_colors, sh_degree)
     cameras = [view.camera for view in scene.train_views]
-    points = random_points(cameras, scene.extent, N_RANDOM_POINTS, rng)
+    points = random_points(cameras, scene.extent, N_RANDOM_POINTS, rng, is_inside)
     return from_points(points, rng.integers(0, 256, points.shape, np.uint8), sh_degree)
 
 
@@ -102,7 +109,9 @@ def from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
     )
 
 
-def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.random.Generator) -> Floats:
+def random_points(
+    cameras: Sequence[Camera], extent: float, n: int, rng: np.random.Generator, is_inside: IsInside | None = None
+) -> Floats:
     """Return points drawn uniformly in the cube around the cameras, without those that no camera sees.
 
     The cube is centred on the mean of the camera centres and reaches ``extent`` to each side, so it holds all cameras.
@@ -117,6 +126,8 @@ def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.rand
     n : int
         Number of points drawn.
     rng : numpy.random.Generator
+    is_inside : callable, optional
+        As for :func:`are_seen`.
 
     Returns
     -------
@@ -125,22 +136,31 @@ def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.rand
     """
     centres = np.array([camera.center for camera in cameras])  # [C, 3]
     points = centres.mean(axis=0) + rng.uniform(-extent, extent, (n, 3))  # [n, 3]
-    return points[are_seen(points, cameras)]
+    return points[are_seen(points, cameras, is_inside)]
 
 
-def are_seen(points: Floats, cameras: Sequence[Camera]) -> Bools:
+def are_seen(points: Floats, cameras: Sequence[Camera], is_inside: IsInside | None = None) -> Bools:
     """Return for each point [P, 3] whether it is inside the image of any camera, [P].
+
+    Parameters
+    ----------
+    points : ndarray of shape (P, 3)
+    cameras : sequence of Camera
+    is_inside : callable, optional
+        Tells it for one camera; by default :func:`may_be_inside`.
+    """
+    is_seen = np.zeros(len(points), bool)
+    for camera in cameras:
+        is_seen |= (is_inside or may_be_inside)(points, camera)
+    return is_seen
+
+
+def may_be_inside(points: Floats, camera: Camera) -> Bools:
+    """Return for each point [P, 3] whether a camera may have it inside its image, [P]; of a pinhole, whether it has.
 
     What a lens does is not known here (:mod:`minisplat_ref.mechanisms.cameras` stands above), so a camera with optics
     counts as seeing all that its kind may: a fisheye and parallel rays every point, others what is in front of them.
     """
-    is_seen = np.zeros(len(points), bool)
-    for camera in cameras:
-        is_seen |= _is_inside_image(points, camera)
-    return is_seen
-
-
-def _is_inside_image(points: Floats, camera: Camera) -> Bools:
     x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
     is_in_front = z > 0
     if camera.optics is not None:

@@ -47,7 +47,8 @@ def initial_state(
     if populate is None:
         if recipe.starts_densely:
             scene = _with_dense_points(scene, settings_of(recipe).get("budget"))
-        gaussians = representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng)
+        first = initial_gaussians(scene, recipe.sh_degree, rng, representation.is_inside)
+        gaussians = representation.extend(first, rng)
     else:
         gaussians = populate(rng)
     gaussians = contiguous(gaussians)

@@ -11,6 +11,7 @@ import numpy as np
 
 from minisplat_ref.io.frames import Unit, Units
 from minisplat_ref.rendering import SPLATTING, Renderer
+from minisplat_ref.strategy.initialization import IsInside, may_be_inside
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.types import NOTHING, Floats, Gaussians, Scene
 
@@ -44,6 +45,9 @@ class Representation(NamedTuple):
     """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
     takes_optics: bool = False
     """Whether the renderer draws through lenses; then scenes are read as photographed."""
+    is_inside: IsInside = may_be_inside
+    """Whether points are inside of a camera's image, as the renderer draws it; random points that no camera sees are
+    left out."""
     units: Units = WORLD_UNITS
     """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
     extends: frozenset[str] = frozenset()

@@ -11,6 +11,7 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.lens.fisheye import rays_of, take_photographs
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
 from minisplat_ref.extensions.lens.stages import OPTICS, stages
@@ -22,7 +23,8 @@ from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import SPLATTING, Request, activate
-from minisplat_ref.types import Gaussians, Model, Optics, Primitives, view_from
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.types import Gaussians, Model, Optics, Primitives, Scene, view_from
 from photo_scenes import DISTORTED, assert_refused, write_colmap
 from scenes import ANTIALIASED, as_dtype, balls, make_camera, make_gaussians
 from tolerances import PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
@@ -363,3 +365,17 @@ def test_gsplats_call_refuses_what_it_cannot_draw():
     ):
         with pytest.raises(InputError, match=message):
             rasterization(**{**call, **wrong})
+
+
+def test_random_points_are_those_that_the_lens_shows(rng):
+    """Of what is in front of a camera, in which a point that is not in the image would stay forever."""
+    camera = make_camera()._replace(optics=Optics("brown", (-0.1,) + 7 * (0.0,)))
+    view = view_from(camera)._replace(image=np.zeros((camera.height, camera.width, 3), np.uint8), view_id=0)
+    scene = Scene("s", (view,), (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(3), 2.0)
+    means = initial_state(scene, find_recipe("lens", 10), 0).gaussians.means.astype(np.float64)
+    x = means @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    pixels = model_of(camera).project(x, camera)
+    slack = 1e-3  # positions are float32
+    assert (x[:, 2] > 0).all() and (np.abs(pixels - [12, 9]) < np.array([12, 9]) + slack).all()
+    assert 1_000 < len(means) < 30_000  # in front there are half of 100,000
+    assert (np.abs(x[:, 0]) > 0.402 * x[:, 2]).any()  # a pinhole shows up to 0.4, this lens up to 0.407

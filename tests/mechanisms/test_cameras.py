@@ -15,6 +15,7 @@ from minisplat_ref.mechanisms.cameras.models import (
     MODELS,
     PADDING,
     PERSPECTIVE,
+    are_inside,
     check_optics,
     model_of,
     ray_table,
@@ -26,7 +27,7 @@ from minisplat_ref.mechanisms.cameras.unscented import COVARIANCE_WEIGHTS, MEAN_
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole, pinhole_jacobians, pinhole_rays
 from minisplat_ref.splatting import splat
-from minisplat_ref.types import Optics, Primitives, ProjectionGradient
+from minisplat_ref.types import Camera, Optics, Primitives, ProjectionGradient
 from scenes import ANTIALIASED, make_camera, turned_camera
 
 PIXELS = 1e-10  # of images some hundred pixels wide: float64 and a few hundred operations
@@ -156,6 +157,22 @@ def test_distances_have_the_gradient_along_the_ray():
     x, v = np.array([[1.0, -2.0, 2.0]]), np.array([6.0])
     assert_allclose(MODELS["fisheye"].depths_vjp(x, v), [[2.0, -4.0, 4.0]])
     assert_allclose(PERSPECTIVE.depths_vjp(x, v), [[0.0, 0.0, 6.0]])
+
+
+def test_what_is_inside_of_an_image_by_hand():
+    """An equidistant fisheye of f = 10 has 45 degrees at 7.9 pixels from the middle of 20 x 20, and 60 at 10.5.
+
+    The pinhole has 45 degrees at 10, on the border, and 44 degrees at 9.7; both are blind behind, the fisheye from 57
+    degrees on. The world is shifted by 3 along z.
+    """
+    angles = np.radians([0, 44, 45, 57, 58, 100, 180])
+    points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles) - 3])
+    camera = Camera(np.eye(3), np.array([0, 0, 3.0]), 10, 10, 10, 10, 20, 20)
+    fisheye = camera._replace(optics=Optics("fisheye", (0.0,) * 4))
+    assert are_inside(points, camera).tolist() == [True, True, False, False, False, False, False]
+    assert are_inside(points, fisheye).tolist() == [True, True, True, True, False, False, False]
+    upright = points[:, [1, 0, 2]]
+    assert_array_equal(are_inside(upright, fisheye), are_inside(points, fisheye))
 
 
 def test_unknown_optics_are_refused():

@@ -166,6 +166,23 @@ def model_of(camera: Camera) -> CameraModel:
     return MODELS[camera.optics.model]
 
 
+def are_inside(points: Floats, camera: Camera) -> Bools:
+    """Return for each point [P, 3] of the world whether it is inside of the image of a camera with any optics, [P].
+
+    Raises
+    ------
+    InputError
+        As :func:`model_of`.
+    """
+    model = model_of(camera)
+    x = points @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    rows = np.flatnonzero(model.is_seen(x, camera))
+    u, v = model.project(x[rows], camera).T
+    inside = np.zeros(len(points), bool)
+    inside[rows] = (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+    return inside
+
+
 def ray_table(camera: Camera) -> Floats:
     """Return the unit directions of all pixels' rays as a table for kernels, float64 and read-only.
 
