@@ -284,6 +284,13 @@ def as_model(model: Any) -> Model:
     return model if isinstance(model, Model) else Model(model)
 
 
+def lit_from_behind(output: RenderOutput, request: Request) -> RenderOutput:
+    """Return the output with the light of :attr:`Request.behind` in its image, which removal changes are those of."""
+    if request.behind is None:
+        return output
+    return output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
+
+
 def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOutput, RenderTape]:
     """Render a model by :func:`render`."""
     gaussians, wants = model.gaussians, request.wants
@@ -300,9 +307,7 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
         with_stats=bool(wants & _OF_STATS),
         with_median_depth="median_depth" in wants,
     )
-    lit = output
-    if request.behind is not None:
-        lit = output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
+    lit = lit_from_behind(output, request)
     extras = {name: extra(tape, lit) for name, extra in _EXTRAS.items() if name in wants}
     return output._replace(extras=extras), tape
 

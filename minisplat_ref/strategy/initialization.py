@@ -20,11 +20,26 @@ INITIAL_OPACITY = 0.1
 N_RANDOM_POINTS = 100_000  # as 3DGS draws for scenes without points
 
 IsInside = Callable[[Floats, Camera], Bools]
-"""``is_inside(points, camera)``: [P] whether points [P, 3] of the world are inside of the camera's image."""
+"""``is_inside(points, camera)``: [P] whether points [P, 3] of the world are inside the camera's image."""
+
+
+def may_be_inside(points: Floats, camera: Camera) -> Bools:
+    """Return for each point [P, 3] whether a camera may have it inside its image, [P]; of a pinhole, whether it has.
+
+    What a lens does is not known here (:mod:`minisplat_ref.mechanisms.cameras` stands above), so a camera with optics
+    counts as seeing all that its kind may: a fisheye and parallel rays every point, others what is in front of them.
+    """
+    x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
+    is_in_front = z > 0
+    if camera.optics is not None:
+        return is_in_front if camera.optics.model == "brown" else np.ones(len(points), bool)
+    z = np.where(is_in_front, z, 1.0)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return is_in_front & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
 
 
 def initial_gaussians(
-    scene: Scene, sh_degree: int, rng: np.random.Generator, is_inside: IsInside | None = None
+    scene: Scene, sh_degree: int, rng: np.random.Generator, is_inside: IsInside = may_be_inside
 ) -> Gaussians:
     """Return Gaussians at the scene's points, or at random ones if it has too few to measure distances.
 
@@ -110,7 +125,7 @@ def from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
 
 
 def random_points(
-    cameras: Sequence[Camera], extent: float, n: int, rng: np.random.Generator, is_inside: IsInside | None = None
+    cameras: Sequence[Camera], extent: float, n: int, rng: np.random.Generator, is_inside: IsInside = may_be_inside
 ) -> Floats:
     """Return points drawn uniformly in the cube around the cameras, without those that no camera sees.
 
@@ -139,7 +154,7 @@ def random_points(
     return points[are_seen(points, cameras, is_inside)]
 
 
-def are_seen(points: Floats, cameras: Sequence[Camera], is_inside: IsInside | None = None) -> Bools:
+def are_seen(points: Floats, cameras: Sequence[Camera], is_inside: IsInside = may_be_inside) -> Bools:
     """Return for each point [P, 3] whether it is inside the image of any camera, [P].
 
     Parameters
@@ -147,24 +162,9 @@ def are_seen(points: Floats, cameras: Sequence[Camera], is_inside: IsInside | No
     points : ndarray of shape (P, 3)
     cameras : sequence of Camera
     is_inside : callable, optional
-        Tells it for one camera; by default :func:`may_be_inside`.
+        Decides for one camera.
     """
     is_seen = np.zeros(len(points), bool)
     for camera in cameras:
-        is_seen |= (is_inside or may_be_inside)(points, camera)
+        is_seen |= is_inside(points, camera)
     return is_seen
-
-
-def may_be_inside(points: Floats, camera: Camera) -> Bools:
-    """Return for each point [P, 3] whether a camera may have it inside its image, [P]; of a pinhole, whether it has.
-
-    What a lens does is not known here (:mod:`minisplat_ref.mechanisms.cameras` stands above), so a camera with optics
-    counts as seeing all that its kind may: a fisheye and parallel rays every point, others what is in front of them.
-    """
-    x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
-    is_in_front = z > 0
-    if camera.optics is not None:
-        return is_in_front if camera.optics.model == "brown" else np.ones(len(points), bool)
-    z = np.where(is_in_front, z, 1.0)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    return is_in_front & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)

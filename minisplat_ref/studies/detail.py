@@ -1,7 +1,7 @@
 """PSNR where a photograph is flat and where it has detail.
 
 A mean over all pixels hides what a method does to detail. So the pixels of each test photograph are split by the
-length of their gradient into the flatter half and the textured half, and both are measured by themselves.
+length of their gradient into the flatter half and the textured half, and each is measured by itself.
 """
 
 from typing import Any, NamedTuple

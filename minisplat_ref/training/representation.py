@@ -46,7 +46,7 @@ class Representation(NamedTuple):
     takes_optics: bool = False
     """Whether the renderer draws through lenses; then scenes are read as photographed."""
     is_inside: IsInside = may_be_inside
-    """Whether points are inside of a camera's image, as the renderer draws it; random points that no camera sees are
+    """Whether points are inside a camera's image, as the renderer draws it; random points that no camera sees are
     left out."""
     units: Units = WORLD_UNITS
     """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""

@@ -36,6 +36,7 @@ from tolerances import (
     COVERAGE_MIN,
     PARITY_FLOAT32_IMAGE,
     PARITY_FLOAT64,
+    REMOVAL,
 )
 
 DRAW = INTEGRATED.renderer
@@ -251,12 +252,12 @@ def test_statistics_are_those_of_integrals(backend, rng):
     wants = frozenset({"stats", "median_depth", "removal_changes"})
     output, expected = (DRAW.render(Model(g), view, Request(backend=b, wants=wants))[0] for b in (backend, REFERENCE))
     for found, statistic in zip(output.stats, expected.stats, strict=True):
-        assert_allclose(found, statistic, rtol=1e-9, atol=PARITY_FLOAT64)
+        assert_allclose(found, statistic, rtol=REMOVAL, atol=PARITY_FLOAT64)
     assert_allclose(output.median_depth, expected.median_depth, atol=PARITY_FLOAT64)
     changes = output.extras["removal_changes"]
     n = int(np.argmax(changes))
     without, _ = DRAW.render(Model(g), view, Request(backend=backend, is_visible=np.arange(12) != n))
-    assert_allclose(changes[n], np.sum((output.image - without.image) ** 2), rtol=1e-9)
+    assert_allclose(changes[n], np.sum((output.image - without.image) ** 2), rtol=REMOVAL)
     assert changes[n] > 0.1 and output.stats.hit_count.sum() > 100
 
 

@@ -23,6 +23,7 @@ from tolerances import (
     CLOSED_FORM,
     PARITY_FLOAT32_IMAGE,
     PARITY_FLOAT64,
+    REMOVAL,
     SURFEL_FLOAT32_GRADIENT,
     SURFEL_HIT,
     SURFEL_PLANE,
@@ -274,5 +275,5 @@ def test_what_a_removal_changes_is_what_is_missing_without_it(backend, rng):
     n = int(np.argmax(changes))
     without, _ = SURFELS.render(Model(g), view_from(camera), Request(backend=backend, is_visible=np.arange(12) != n))
     lit, dark = (image.image + (1 - image.alpha[..., None]) * behind for image in (output, without))
-    assert_allclose(changes[n], np.sum((lit - dark) ** 2), rtol=1e-9)
+    assert_allclose(changes[n], np.sum((lit - dark) ** 2), rtol=REMOVAL)
     assert changes[n] > 0.1

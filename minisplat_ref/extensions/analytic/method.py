@@ -23,22 +23,11 @@ def composite(
     background: Floats,
     bins: TileBins,
     conventions: Conventions,
-    *,
-    with_stats: bool = False,
-    with_median_depth: bool = False,
+    **wanted: bool,
 ) -> RenderOutput:
     """Blend integrals with the plain kernels; arguments and result are those of ``reference.compositing.composite``."""
     response = response_for(colors.dtype)
-    return kernel_hits.composite_hits(
-        response,
-        projection,
-        colors,
-        background,
-        bins,
-        conventions,
-        with_stats=with_stats,
-        with_median_depth=with_median_depth,
-    )
+    return kernel_hits.composite_hits(response, projection, colors, background, bins, conventions, **wanted)
 
 
 def composite_vjp(

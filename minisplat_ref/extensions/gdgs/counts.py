@@ -1,7 +1,7 @@
 """The study ``gdgs/counts``: detail at an equal number of Gaussians, for GDGS beside 3DGS.
 
 On photographs GDGS ends with more Gaussians than 3DGS does, so that one training of each says little. Here both are
-drawn as curves over their number, by the threshold of gradients from which on they clone and split.
+curves over their number, which follows from the threshold of gradients from which on they clone and split.
 """
 
 import argparse

@@ -167,7 +167,7 @@ def model_of(camera: Camera) -> CameraModel:
 
 
 def are_inside(points: Floats, camera: Camera) -> Bools:
-    """Return for each point [P, 3] of the world whether it is inside of the image of a camera with any optics, [P].
+    """Return for each point [P, 3] of the world whether it is inside the image of a camera with any optics, [P].
 
     Raises
     ------

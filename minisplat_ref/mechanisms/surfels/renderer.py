@@ -22,7 +22,15 @@ from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.removal import removal_changes_of_hits
-from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, choose_degree, parameters_vjp
+from minisplat_ref.rendering import (
+    Renderer,
+    RenderGradient,
+    Request,
+    activate,
+    choose_degree,
+    lit_from_behind,
+    parameters_vjp,
+)
 from minisplat_ref.types import (
     BlendGradient,
     Camera,
@@ -213,10 +221,7 @@ def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tupl
         image = np.concatenate([image[:, :, :at], measures.median[:, :, None].astype(dtype), image[:, :, at:]], axis=2)
     extras = {}
     if "removal_changes" in request.wants:
-        lit = blended
-        if request.behind is not None:
-            lit = blended._replace(image=image + (1 - blended.alpha[..., None]) * request.behind)
-        extras["removal_changes"] = shown.removal_changes(lit)
+        extras["removal_changes"] = shown.removal_changes(lit_from_behind(blended, request))
     output = blended._replace(
         image=image,
         extras=extras,

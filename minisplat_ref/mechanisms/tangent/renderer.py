@@ -21,7 +21,7 @@ from minisplat_ref.mechanisms.tangent.planes import (
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
 from minisplat_ref.reference.removal import removal_changes_of_hits
-from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
+from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, lit_from_behind, parameters_vjp
 from minisplat_ref.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
@@ -184,10 +184,7 @@ def _extras(p: Prepared, bins: TileBins, output: RenderOutput, request: Request)
         if "dominant_depth" in request.wants:
             extras["dominant_depth"] = np.append(p.footprints.depths, 0)[dominant_ids].astype(p.channels.dtype)
     if "removal_changes" in request.wants:
-        lit = output
-        if request.behind is not None:
-            lit = output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
-        extras["removal_changes"] = p.removal_changes(bins, lit)
+        extras["removal_changes"] = p.removal_changes(bins, lit_from_behind(output, request))
     return extras
 
 
