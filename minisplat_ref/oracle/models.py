@@ -68,19 +68,33 @@ def model_cases(
     backend: Backend, conventions: Conventions, representation: Representation | None, stages: Stages | None
 ) -> list[Case]:
     """Return the cases of a renderer, where there is one, and of further stages; see :func:`check_model_gradients`."""
-    rng = np.random.default_rng(SEED)
-    tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
-
-    def all_stages(setting: Setting) -> tuple[Stage, ...]:
-        whole = () if representation is None else (model_stage(backend, setting, representation, rng),)
-        further = () if stages is None else tuple(stages(backend, setting, rng))
-        names = {stage.name for stage in further}
-        return (*(stage for stage in whole if stage.name not in names), *further)
-
-    checked = with_progress(all_stages(tiny), f"{backend.name}, Jacobians", "stages")
+    tiny, larger, rng = model_settings(conventions)
+    tiny_stages = model_stages(backend, tiny, representation, stages, rng)
+    checked = with_progress(tiny_stages, f"{backend.name}, Jacobians", "stages")
     cases: list[Case] = [jacobian_case(stage) for stage in checked]
-    checked = with_progress(all_stages(larger), f"{backend.name}, inner products", "stages")
+    larger_stages = model_stages(backend, larger, representation, stages, rng)
+    checked = with_progress(larger_stages, f"{backend.name}, inner products", "stages")
     return cases + [inner_product_case(stage, rng) for stage in checked]
+
+
+def model_settings(conventions: Conventions) -> tuple[Setting, Setting, np.random.Generator]:
+    """Return the scene of the Jacobians, that of the inner products, and the generator of what follows."""
+    rng = np.random.default_rng(SEED)
+    return tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3), rng
+
+
+def model_stages(
+    backend: Backend,
+    setting: Setting,
+    representation: Representation | None,
+    stages: Stages | None,
+    rng: np.random.Generator,
+) -> tuple[Stage, ...]:
+    """Return the whole renderer, where there is one, and the further stages; one with its name replaces it."""
+    whole = () if representation is None else (model_stage(backend, setting, representation, rng),)
+    further = () if stages is None else tuple(stages(backend, setting, rng))
+    names = {stage.name for stage in further}
+    return (*(stage for stage in whole if stage.name not in names), *further)
 
 
 def model_stage(backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator) -> Stage:

@@ -2,8 +2,8 @@
 
 That is its renderer, with every field and shared parameter and, where a recipe of it switches calibrations on, with
 these around it; its loss terms, but for those that a stage of its own replaces by its name; and the stages that it
-names. What it shares with 3DGS is checked without it. A relative that has nothing of its own to check does not pass:
-there is nothing that the check could have found.
+names. Renderer and stages must also compute the same on every backend. What it shares with 3DGS is checked without it.
+A relative that has nothing of its own to check does not pass: there is nothing that the check could have found.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.methods import RECIPES
+from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.oracle.gradients import by_backend
 from minisplat_ref.oracle.loss_terms import loss_cases, own_terms, stage_name
@@ -57,15 +58,15 @@ def check_relative_gradients(backends: Sequence[Backend], conventions: Conventio
         is nothing to check.
     """
     names = ", ".join(backend.name for backend in backends)
-    of_backends = [_cases(backend, conventions, relative) for backend in backends]
+    same = agreement_cases(backends, conventions, _own_representation(relative), relative.stages)
+    of_backends = [_cases(b, conventions, relative) + agrees for b, agrees in zip(backends, same, strict=True)]
     cases = by_backend(backends, of_backends) if any(of_backends) else (_nothing(relative),)
     settings = {"backend": names, "profile": conventions.name, "dtype": "float64", "seed": SEED, "time": TIME}
     return Report(f"gradients of {relative.name} on {names}, profile {conventions.name}, float64", cases, settings)
 
 
 def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> list[Case]:
-    representation = None if relative.representation == GAUSSIANS else relative.representation
-    cases = model_cases(backend, conventions, representation, relative.stages)
+    cases = model_cases(backend, conventions, _own_representation(relative), relative.stages)
     for recipe in relative.recipes:
         if recipe.active_calibrations:
             calibrated = _with_calibrations(relative.representation, recipe)
@@ -77,6 +78,10 @@ def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> li
     for term in with_progress(left, f"{backend.name}, losses", "terms"):
         cases += loss_cases(term, backend, conventions, relative.representation)
     return cases
+
+
+def _own_representation(relative: Relative) -> Representation | None:
+    return None if relative.representation == GAUSSIANS else relative.representation
 
 
 def _with_calibrations(representation: Representation, recipe: Recipe) -> Representation:

@@ -14,7 +14,9 @@ from minisplat_ref.extensions.satellite import affine_fit, boxes, reference, rpc
 from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
 from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.stages import stages
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
+from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.training.initial_state import initial_state
@@ -454,3 +456,13 @@ def test_backends_agree_on_what_is_highest(rng):
         images.append(SATELLITE.render(model, truth.scene.train_views[1], request)[0].image)
     assert_allclose(images[1], images[0], atol=PARITY_FLOAT64)
     assert np.median(images[0][..., 6]) > 0.7 * boxes.HIGH
+
+
+@pytest.mark.parametrize("is_wrong", [False, True])
+def test_the_oracle_finds_a_wrong_order_of_altitudes(is_wrong, monkeypatch):
+    """Negative floats in the order of their bits, as they once were: no gradient is wrong then."""
+    if is_wrong:
+        monkeypatch.setattr("minisplat_ref.cpu.tiling.keys_of", lambda depths: depths.view(np.int64))
+    own, compared = agreement_cases((REFERENCE, CPU), GSPLAT_MAIN, SEEN_FROM_ABOVE, stages)
+    assert own == [] and [case.passed for case in compared] == [True, not is_wrong]
+    assert "affine" in compared[1].name

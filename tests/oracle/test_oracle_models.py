@@ -103,6 +103,15 @@ def test_stages_of_an_extension_are_checked_too():
     assert report.n_failed == 0
 
 
+def test_a_stage_named_like_the_renderer_replaces_it(small_proof):
+    def stages(backend, setting, rng):
+        return (project_stage(backend, setting)._replace(name="render gaussians"),)
+
+    report = check_model_gradients(REFERENCE, GSPLAT_MAIN, GAUSSIANS, stages)
+    assert [case.name for case in report.cases] == ["render gaussians: Jacobian", "render gaussians: inner products"]
+    assert "mean alpha" not in report.cases[0].figures
+
+
 def test_the_command(tmp_path, capsys):
     path = tmp_path / "cases.json"
     assert main(["oracle", "gradients", "--extension", "velocity", "--backend", "cpu", "--json", str(path)]) == 0

@@ -19,9 +19,11 @@ from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.geometry import losses as geometric_losses
 from minisplat_ref.extensions.micro import method as micro
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.loss_terms import loss_cases, loss_stage, own_terms
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.relatives import Relative, check_relative_gradients
+from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.training.calibration import EXPOSURES, expose_vjp
 from minisplat_ref.training.losses import Cotangents, LossTerm
 from minisplat_ref.training.representation import GAUSSIANS
@@ -68,9 +70,49 @@ def test_a_sign_in_the_kernels_alone_is_found(small_proof, wrong_cut_kernels, ca
 
 def test_every_backend_is_checked_unless_one_is_named(small_proof, capsys):
     code, output = proof(capsys, "velocity")
-    assert code == 0 and "all 6 cases passed" in output
+    assert code == 0 and "all 8 cases passed" in output
     assert all(f"| {name}: render moving Gaussians: Jacobian" in output for name in BACKENDS)
+    assert output.count("render moving Gaussians: as on reference") == len(BACKENDS) - 1
     assert "all 2 cases passed" in proof(capsys, "velocity", "--backend", "cpu")[1]
+
+
+def of_values(shift):
+    """Return stages with one of two outputs, whose backends differ by ``shift`` in the second, as no gradient shows."""
+
+    def stages(backend, setting, rng):
+        def function(values):
+            return Point((values, values + (shift if backend is CPU else 0.0)))
+
+        return (Stage("copies", {"values": rng.normal(size=3)}, ("right", "shifted"), function, lambda v, w: (v + w,)),)
+
+    return stages
+
+
+def test_backends_that_differ_by_a_constant_are_found():
+    relative = Relative("shifted", GAUSSIANS, (), (), of_values(1e-6))
+    report = check_relative_gradients((REFERENCE, CPU), GSPLAT_MAIN, relative)
+    assert [case.name for case in report.cases if not case.passed] == ["cpu: copies: as on reference"]
+    assert report.cases[-1].note == "shifted not as on reference" and report.cases[-1].figures["error"] > 1e-7
+    alone = check_relative_gradients((CPU,), GSPLAT_MAIN, relative)
+    assert alone.n_failed == 0 and len(alone.cases) == 2
+    same = relative._replace(stages=of_values(0.0))
+    assert check_relative_gradients((REFERENCE, CPU), GSPLAT_MAIN, same).n_failed == 0
+
+
+def test_a_shape_of_its_own_is_a_difference():
+    def stages(backend, setting, rng):
+        n = 2 if backend is CPU else 1
+
+        def function(values):
+            return Point((np.tile(values, n),))
+
+        def vjp(v):
+            return (v.reshape(n, -1).sum(axis=0),)
+
+        return (Stage("tiled", {"values": rng.normal(size=3)}, ("tiles",), function, vjp),)
+
+    report = check_relative_gradients((REFERENCE, CPU), GSPLAT_MAIN, Relative("tiled", GAUSSIANS, (), (), stages))
+    assert report.n_failed == 1 and report.cases[-1].figures["error"] == np.inf
 
 
 # --- loss terms ---

@@ -24,8 +24,9 @@ A difference across a threshold is refused, and a check of nothing fails.
 With --extension NAME everything that the extension has of its own is checked,
 for every backend: its whole renderer with respect to every field of its
 population and every shared parameter, at time 0.7; its loss terms and those of
-its recipes, whatever their weight; and the stages that it names. An extension
-that has nothing of its own to check fails.
+its recipes, whatever their weight; and the stages that it names. Renderer and
+stages must compute the same on every backend. An extension that has nothing of
+its own to check fails.
 """
 EPILOG = """\
 examples:

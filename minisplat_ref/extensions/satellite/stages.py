@@ -29,11 +29,14 @@ TIE = 1e-12
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer with the sun: by an orthographic camera, in place of that without, and by an affine one."""
+    """Return the renderer with the sun: by an orthographic camera, in place of that without, and by an affine one.
+
+    The affine camera, as those of satellites, has depths of both signs.
+    """
     per_unit = np.array([setting.camera.fx, setting.camera.fy, 1.0]) / 3  # the Gaussians lie at depth 3
     shift = 1.3, -0.9
     A = per_unit[:, None] * (setting.camera.cam_from_world_R + 0.02 * rng.normal(size=(3, 3)))
-    b = per_unit * setting.camera.cam_from_world_t + [setting.camera.width / 2, setting.camera.height / 2, 0]
+    b = per_unit * setting.camera.cam_from_world_t + [setting.camera.width / 2, setting.camera.height / 2, -1]
     flat = setting.camera._replace(fx=per_unit[0], fy=per_unit[1], optics=Optics("orthographic", shift))
     affine = Camera(A, b, 1.0, 1.0, 0.0, 0.0, flat.width, flat.height, Optics(AFFINE, shift))
     name = SEEN_FROM_ABOVE.name
