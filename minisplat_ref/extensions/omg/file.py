@@ -26,11 +26,19 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
 from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_differences, to_halves
+from minisplat_ref.extensions.omg.parts import (
+    GAUSSIANS_MAX,
+    are_codes,
+    are_planes,
+    is_center,
+    no_gaussians,
+    read_codes,
+    read_integers,
+)
 from minisplat_ref.extensions.omg.svq import QUAT_MIN, Quantised, quantise, unit_quats
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms.packing.container import (
-    WAY_OUT,
     Container,
     Packed,
     is_count,
@@ -41,12 +49,11 @@ from minisplat_ref.mechanisms.packing.container import (
     write_label,
 )
 from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes
+from minisplat_ref.mechanisms.packing.planes import to_planes
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"OMG\n", version=1)
-GAUSSIANS_MAX = 2**31 - 1
 CODES_MAX = 2**16
 
 
@@ -167,8 +174,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     packed = parse(CONTAINER, content, source)
     header = _check_header(packed)
     n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
-    offsets = from_differences(_planes(packed, header, "means", 3))
-    vectors = {name: _vectors(packed, header, name) for name in WIDTHS}
+    offsets = from_differences(read_integers(packed, header, "means", 3))
+    vectors = {name: read_codes(packed, header, name, width).vectors() for name, width in WIDTHS.items()}
     raw = unpack(packed, "decoder", 2 * (1 + header.n_features) * 3 * n_rest)
     table = np.frombuffer(raw, "<f2").reshape(1 + header.n_features, 3 * n_rest)
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
@@ -199,22 +206,6 @@ class _Header(NamedTuple):
     planes: Mapping[str, int]
 
 
-def _planes(packed: Packed, header: _Header, name: str, n_columns: int) -> Any:
-    n_planes = header.planes[name]
-    return from_planes(unpack(packed, name, n_planes * n_columns * header.n), n_planes, n_columns, header.n)
-
-
-def _vectors(packed: Packed, header: _Header, name: str) -> Floats:
-    """Return the vectors [N, D] of a stream of indices and its codebooks."""
-    counts, width = header.codes[name], WIDTHS[name]
-    raw = unpack(packed, f"{name} codes", 2 * width * sum(counts))
-    codes = np.split(np.frombuffer(raw, "<f2").reshape(-1, width), np.cumsum(counts)[:-1])
-    indices: Ints = _planes(packed, header, name, len(counts)).astype(np.int64)
-    if (indices >= np.array(counts)).any():
-        raise InputError(f"{packed.source}: damaged, {name} have codes that are not in their codebook; {WAY_OUT}")
-    return Quantised(tuple(codes), indices).vectors()
-
-
 def _check_header(packed: Packed) -> _Header:
     """Return the header after checking every value that is read."""
     values = {name: packed.header.get(name) for name in _Header._fields}
@@ -223,25 +214,16 @@ def _check_header(packed: Packed) -> _Header:
         is_count(n, GAUSSIANS_MAX)
         and is_count(degree, SH_DEGREE_MAX)
         and is_count(level)
-        and isinstance(center, list)
-        and len(center) == 3
-        and all(type(x) is float and abs(x) <= FARTHEST for x in center)
+        and is_center(center)
         and is_count(n_features, 3 * ((SH_DEGREE_MAX + 1) ** 2 - 1))
-        and isinstance(codes, dict)
-        and set(codes) == set(WIDTHS)
-        and isinstance(planes, dict)
-        and set(planes) == {"means", *WIDTHS}
-        and all(is_count(n_planes, PLANES_MAX) and n_planes for n_planes in planes.values())
+        and are_planes(planes, WIDTHS)
     )
     if is_right:
-        assert isinstance(codes, dict) and isinstance(n_features, int)
+        assert isinstance(n_features, int)
         n_parts = {"scales": 3, "rotations": 2, "opacities": 1, "appearance": -(-(3 + n_features) // 2)}
-        is_right = all(
-            isinstance(counts, list) and len(counts) == n_parts[name] and all(is_count(k, CODES_MAX) for k in counts)
-            for name, counts in codes.items()
-        )
+        is_right = are_codes(codes, {name: (n_parts[name], CODES_MAX) for name in WIDTHS})
     if not is_right:
-        raise InputError(f"{packed.source}: damaged, its header does not describe Gaussians (n {n}); {WAY_OUT}")
+        raise no_gaussians(packed)
     return _Header(**values)  # type: ignore[arg-type]
 
 

@@ -23,17 +23,25 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_differences, to_halves
 from minisplat_ref.extensions.omg.decoding import split_codes
+from minisplat_ref.extensions.omg.parts import (
+    GAUSSIANS_MAX,
+    are_codes,
+    are_planes,
+    is_center,
+    no_gaussians,
+    read_codes,
+    read_integers,
+)
 from minisplat_ref.extensions.omg.population import CODEBOOKS, PLACE, SIZES, OmgGaussians
 from minisplat_ref.extensions.omg.renderer import decode as decode_model
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
+from minisplat_ref.mechanisms.packing.container import Container, Packed, is_count, pack, parse, unpack
 from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes
+from minisplat_ref.mechanisms.packing.planes import from_planes, to_planes
 from minisplat_ref.types import Floats, Frame, Gaussians, Ints, Model
 from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"OMT\n", version=1)
-GAUSSIANS_MAX = 2**31 - 1
 N_REST = 15  # coefficients of degrees 1 to 3
 N_PARTS = sum(shape[0] for shape in CODEBOOKS.values())
 
@@ -112,19 +120,14 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     shared = _networks(packed)
     columns = []
     for name, shape in CODEBOOKS.items():
-        counts = header.codes[name]
-        raw = unpack(packed, f"{name} codes", 2 * shape[2] * sum(counts))
-        parts = np.split(np.frombuffer(raw, "<f2").reshape(-1, shape[2]).astype(np.float32), np.cumsum(counts)[:-1])
-        shared[name] = np.stack([np.pad(part, ((0, shape[1] - len(part)), (0, 0))) for part in parts])
-        indices = _planes(packed, header, name, shape[0])
-        if (indices >= np.array(counts, np.uint64)).any():
-            raise InputError(f"{source}: damaged, {name} have codes that are not in their codebook; {WAY_OUT}")
-        columns.append(indices.astype(np.float32))
-    offsets = from_differences(_planes(packed, header, "means", 3)).astype(np.float32)
+        found = read_codes(packed, header, name, shape[2])
+        rows = [part.astype(np.float32) for part in found.codes]
+        shared[name] = np.stack([np.pad(part, ((0, shape[1] - len(part)), (0, 0))) for part in rows])
+        columns.append(found.indices.astype(np.float32))
+    offsets = from_differences(read_integers(packed, header, "means", 3)).astype(np.float32)
     shared[PLACE] = np.array([0, 0, 0, header.inverse_radius])
-    with np.errstate(
-        over="ignore", invalid="ignore", divide="ignore"
-    ):  # of damaged files; what is not finite is refused
+    # of damaged files; what is not finite is refused
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         coded = OmgGaussians(
             means=offsets,
             quats=np.zeros((n, 4), np.float32),
@@ -164,11 +167,6 @@ class _Header(NamedTuple):
     planes: Mapping[str, int]
 
 
-def _planes(packed: Packed, header: _Header, name: str, n_columns: int) -> Any:
-    n_planes = header.planes[name]
-    return from_planes(unpack(packed, name, n_planes * n_columns * header.n), n_planes, n_columns, header.n)
-
-
 def _is_length(value: Any) -> bool:
     return type(value) is float and 1 / FARTHEST <= value <= FARTHEST
 
@@ -179,25 +177,14 @@ def _check_header(packed: Packed) -> _Header:
     n, center, unit, inverse_radius, codes, planes = values.values()
     is_right = (
         is_count(n, GAUSSIANS_MAX)
-        and isinstance(center, list)
-        and len(center) == 3
-        and all(type(x) is float and abs(x) <= FARTHEST for x in center)
+        and is_center(center)
         and _is_length(unit)
         and _is_length(inverse_radius)
-        and isinstance(codes, dict)
-        and set(codes) == set(CODEBOOKS)
-        and all(
-            isinstance(codes[name], list)
-            and len(codes[name]) == n_parts
-            and all(is_count(k, k_max) for k in codes[name])
-            for name, (n_parts, k_max, _) in CODEBOOKS.items()
-        )
-        and isinstance(planes, dict)
-        and set(planes) == {"means", *CODEBOOKS}
-        and all(is_count(n_planes, PLANES_MAX) and n_planes for n_planes in planes.values())
+        and are_codes(codes, {name: shape[:2] for name, shape in CODEBOOKS.items()})
+        and are_planes(planes, CODEBOOKS)
     )
     if not is_right:
-        raise InputError(f"{packed.source}: damaged, its header does not describe Gaussians (n {n}); {WAY_OUT}")
+        raise no_gaussians(packed)
     return _Header(**values)  # type: ignore[arg-type]
 
 
