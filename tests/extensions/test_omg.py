@@ -302,7 +302,7 @@ def test_damaged_files():
     for lie in [*lies, {"planes": {"means": 1}}, {"sh_degree": 4}, {"codes": codes | {"scales": [-1, 2, 3]}}]:
         assert "does not describe Gaussians" in refusal(omg.OMG_FILE, with_header(content, **lie))
     assert "damaged" in refusal(omg.OMG_FILE, with_header(content, codes=codes))
-    assert "codebook" in refusal(omg.OMG_FILE, repacked(content, lose_codes))
+    assert "codebook" in refusal(omg.OMG_FILE, repacked(content, lose_code))
     assert "means is nan" in refusal(omg.OMG_FILE, repacked(content, make_nan))
 
 
@@ -315,10 +315,11 @@ def repacked(content, change):
     return omg.pack(omg.CONTAINER, header, streams)
 
 
-def lose_codes(header, streams):
-    """Drop all codes of opacities but one."""
-    header["codes"] = header["codes"] | {"opacities": [1]}
-    streams["opacities codes"] = streams["opacities codes"][:2]
+def lose_code(header, streams):
+    """Drop the last code of opacities, so that the largest index is their number."""
+    (n_codes,) = header["codes"]["opacities"]
+    header["codes"] = header["codes"] | {"opacities": [n_codes - 1]}
+    streams["opacities codes"] = streams["opacities codes"][:-2]
 
 
 def make_nan(header, streams):
