@@ -22,7 +22,6 @@ from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_band, show, with_deviation
 from minisplat_ref.training.compensation import compensation, with_compensation
-from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View, view_from
 
@@ -62,7 +61,7 @@ def _drawn_by(renderer: Renderer, recipe: Recipe) -> Recipe:
 def train_arm(arm: str, scene: Scene, iterations: int, seed: int) -> Trained:
     """Train a scene with a recipe of ``COLORS``."""
     recipe = recipe_of(arm, iterations)
-    state = train(scene, recipe, seed=seed, backend=CPU)
+    state = kit.train_with_progress(scene, recipe, seed, backend=CPU)
     return Trained(state.model, recipe.renderer, scene.background)
 
 

@@ -21,8 +21,7 @@ from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, BROWN, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
 from minisplat_ref.studies import kit
-from minisplat_ref.studies.figures import plot_band, show
-from minisplat_ref.training.loop import train
+from minisplat_ref.studies.figures import plot_band, show, with_deviation
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Floats, Model, Scene, view_from
 
@@ -59,7 +58,9 @@ class Figures(NamedTuple):
 def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     """Train the scene without and with levels, and build levels for the former; return all variants by name."""
     plain, compensated = (
-        train(scene, find_recipe("3dgs", iterations), seed=seed, backend=CPU, conventions=conventions).gaussians
+        kit.train_with_progress(
+            scene, find_recipe("3dgs", iterations), seed, backend=CPU, conventions=conventions
+        ).gaussians
         for conventions in (GSPLAT_MAIN, COMPENSATED)
     )
     zero = level_zero(plain, np.random.default_rng(0))
@@ -67,7 +68,7 @@ def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     built = {name: with_levels(zero, densities, plan, GSPLAT_MAIN) for name, plan in PLANS.items()}
     early = built["levels 4"]._replace(cells=built["levels 4"].cells / EARLY)
     recipe = configure(find_recipe("multi-scale", iterations), factor=4, n_levels=2)
-    trained = train(scene, recipe, seed=seed, backend=CPU).gaussians
+    trained = kit.train_with_progress(scene, recipe, seed, backend=CPU).gaussians
     return {
         "3dgs": Variant(plain, SPLATTING),
         "compensated": Variant(plain, SPLATTING, COMPENSATED),
@@ -130,8 +131,9 @@ def run(args: argparse.Namespace) -> kit.Report:
     found = measure(scene, args.iterations, args.seeds)
     rows = []
     for name, runs in found.figures.items():
-        psnr, pairs, hits = np.moveaxis(np.mean(np.array(runs), axis=0), -1, 0)  # [blocks] each
-        cells = [f"{p:.2f}, {n / 1e3:.1f}, {h / 1e3:.0f}" for p, n, h in zip(psnr, pairs, hits, strict=True)]
+        psnrs, pairs, hits = np.moveaxis(np.array(runs), -1, 0)  # [seeds, blocks] each
+        work = zip(psnrs.T.tolist(), pairs.mean(axis=0), hits.mean(axis=0), strict=True)
+        cells = [f"{with_deviation(p, 2)}, {n / 1e3:.1f}, {h / 1e3:.0f}" for p, n, h in work]
         rows.append([name, f"{np.mean(found.counts[name]):,.0f}", *cells])
     table = markdown_table(["", "Gaussians", *_sizes(found)], rows)
     by_name = {
@@ -140,7 +142,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     }
     result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
     result |= {"blocks": found.blocks, "counts": found.counts, "figures": by_name}
-    text = "PSNR (dB) of test views, and thousands of pairs and of hits per view: means over the seeds"
+    text = "PSNR (dB) of test views, thousands of pairs and of hits per view; means over the seeds, and their deviation"
     return kit.Report(result, draw(found), f"{text}\n\n{table}", arms=by_name)
 
 
