@@ -280,6 +280,8 @@ def test_reading_by_hand():
     assert_allclose(found, [[0.75 + 2 * 0.25, 0.25]], rtol=CLOSED_FORM)
     value, _ = bank.feature_error(np.array([[0.0, 2]]), np.array([[3.0, 4]]))
     assert_allclose(value, (9 + 4) / 2 + 1 - 0.8, rtol=1e-6)  # the floor of lengths
+    value, _ = bank.feature_error(np.array([[0.0, 2], [5, 0]]), np.array([[3.0, 4], [1, 0]]))
+    assert_allclose(value, (9 + 4 + 16) / 4 + 1 - (0.8 + 1) / 2, rtol=1e-6)
 
 
 # Maps

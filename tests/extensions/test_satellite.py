@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import quad
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -49,6 +50,16 @@ def test_utm_of_a_meridian():
     assert south[0, 1] == pytest.approx(1e7 - arc, abs=1e-3)
     with pytest.raises(InputError, match="84 degrees"):
         utm.utm_from_degrees(np.zeros(1), np.array([85.0]), 31, is_south=False)
+
+
+@pytest.mark.parametrize("latitude", [3.0, 30.0, 61.0, 80.0])
+def test_northings_are_arcs_of_the_meridian(latitude):
+    """On a central meridian the northing is 0.9996 of the ellipse's arc, here by quadrature, to a micrometre."""
+    a, f = 6_378_137.0, 1 / 298.257223563
+    e2 = f * (2 - f)
+    arc = quad(lambda phi: a * (1 - e2) / (1 - e2 * np.sin(phi) ** 2) ** 1.5, 0, np.radians(latitude), epsrel=1e-13)[0]
+    found = utm.utm_from_degrees(np.full(1, 9.0), np.full(1, latitude), 32, is_south=False)
+    assert np.abs(found - [500_000, 0.9996 * arc]).max() < 1e-6
 
 
 def make_rpc(curved=0.0):

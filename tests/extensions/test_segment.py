@@ -309,6 +309,11 @@ def test_masks_are_shifted_and_lost():
     moved = [n for n in zeros if 0 < n < 400]
     assert len(moved) == 3 and all(400 - 17 * 17 <= n <= 400 - 15 * 15 for n in moved)  # by 3 to 5 along both axes
     assert all((m == 1 + i).any() or n == 400 for i, (m, n) in enumerate(zip(spoiled, zeros, strict=True)))
+    all_moved = study.spoil([np.ones((20, 20), int)] * 60, 1.0, 0.0, np.random.default_rng(1))
+    counts = np.array([[20 - m.any(axis=1).sum(), 20 - m.any(axis=0).sum()] for m in all_moved])
+    assert all(set(along) == {3, 4, 5} for along in counts.T)
+    starts = {tuple(np.argwhere(m)[0] > 0) for m in all_moved}
+    assert len(starts) == 4  # to either side, along both axes
 
 
 def test_iou_by_hand(monkeypatch):

@@ -12,7 +12,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.style import method, study
+from minisplat_ref.extensions.style import method, run_files, study
 from minisplat_ref.extensions.style.reference import (
     FeatureWeights,
     feature_loss,
@@ -164,6 +164,7 @@ def test_only_the_largest_above_the_threshold_are_split():
         assert set(edit.parent_ids[edit.is_new]) == ({3, 7} if n_new == 8 else {7})
     assert not split_large(g, factor=10.0, max_share=0.05, n_children=4).is_new.any()
     assert_array_equal(largest(np.array([1.0, 3, 2, 0]), 0.0, 0.5), [False, True, True, False])
+    assert_array_equal(largest(np.array([2.0, 3, 2, 2]), 2.0, 1.0), [False, True, False, False])  # not at the threshold
 
 
 def test_stretch_is_cut_at_the_second_axis():
@@ -247,7 +248,27 @@ def test_a_run_with_more_than_gaussians_is_refused(folder, tmp_path, capsys):
     assert "has parameters besides its Gaussians" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
+def test_a_run_without_gaussians_is_refused(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(run_files, "load_ply", lambda path: Gaussians(*(field[:0] for field in load_ply(path))))
+    words = ["style", "transfer", str(folder / "run"), str(folder / "stripes.png"), "--out", str(tmp_path / "no")]
+    assert main(words) == 2
+    assert "holds no Gaussians" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
 # The study
+
+
+def test_swatches_are_stripes_and_checks():
+    """Four dark pixels of nine, along either axis, the same along the other diagonal; checks of six pixels."""
+    found = study.swatches()
+    y, x = np.mgrid[: study.SIDE, : study.SIDE]
+    phase = (x + y) % 9
+    is_dark = found["stripes"][..., 2] < 0.7
+    assert_array_equal(is_dark[phase > 0], phase[phase > 0] < 5)  # at 0, between two stripes, rounding decides
+    red = found["checks"][..., 1] < 0.5
+    assert_array_equal(red[6:], ~red[:-6])
+    assert_array_equal(red[:, 6:], ~red[:, :-6])
+    assert red[:6, :6].all() and not red[:6, 6:12].any()
 
 
 def test_sliced_distance_by_hand(rng):

@@ -1,0 +1,230 @@
+"""The studies of satellites, and what they rest on: cameras of the boxes, shears and consistency by hand, each arm."""
+
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.satellite import affine_fit, boxes, claims
+from minisplat_ref.extensions.satellite.losses import shear_of, view_consistency
+from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.surface_model import surface_model
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.losses import Rendered
+from minisplat_ref.types import Model, view_from
+from scenes import as_dtype
+from tolerances import CLOSED_FORM
+
+# --- cameras ---
+
+
+def test_what_is_high_is_seen_beside():
+    """By a tilt of (0.4, -0.3), 10 m move by 4 m to the west in the image and, as north is up, by 3 m to the north."""
+    camera = boxes._camera(np.array([0.4, -0.3]), 96, 96.0, None)  # pixels of a metre
+
+    def seen(x, y, z):
+        return camera.cam_from_world_R @ (np.array([x, y, z]) / boxes.SCALE) + camera.cam_from_world_t
+
+    assert_allclose(seen(0, 0, 0), [48, 48, 0], atol=CLOSED_FORM)
+    assert_allclose(seen(7, 5, 0), [55, 43, 0], rtol=CLOSED_FORM)
+    assert_allclose(seen(7, 5, 10), [51, 40, -10], rtol=CLOSED_FORM)
+
+
+@pytest.mark.parametrize("size", [(1200, 1200), (600, 1200)])
+def test_the_half_diagonal_of_a_photograph_is_one(size, monkeypatch):
+    """With pixels of half a metre, north up: the corners are half of 300 or 600 by 600 m away from the middle."""
+
+    def localise(rpc, pixels, altitudes):
+        return np.column_stack([pixels * [0.5, -0.5] + 1000, altitudes])
+
+    monkeypatch.setattr(affine_fit, "localise", localise)
+    monkeypatch.setattr(affine_fit, "zone_of", lambda longitude: 33)
+    monkeypatch.setattr(affine_fit, "utm_from_degrees", lambda x, y, zone, is_south: np.column_stack([x, y]))
+    frame = affine_fit.frame_of([None], size, (20.0, 80.0))
+    width, height = size
+    assert_allclose(frame.scale, np.hypot(width, height) / 4, rtol=CLOSED_FORM)
+    assert_allclose(frame.origin, [1000 + width / 4, 1000 - height / 4, 20.0], rtol=CLOSED_FORM)
+
+
+# --- consistency of views ---
+
+
+def rendered_of(means, camera, step=1):
+    """Return what a shear needs: the view, the means, the iteration."""
+    model = SimpleNamespace(gaussians=SimpleNamespace(means=means))
+    request = SimpleNamespace(conventions=GSPLAT_MAIN)
+    return SimpleNamespace(view=view_from(camera), request=request, constant=SimpleNamespace(model=model), step=step)
+
+
+def test_a_shear_is_of_the_size_of_the_image():
+    """In coordinates of -1 to 1 it has the deviation that is given: half of the width, and of the height, in pixels."""
+    high = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4 / boxes.SCALE]])  # altitudes span 4 m, 2 m to either side
+    camera = boxes.zenith(40)._replace(height=20)
+    shears = np.array([shear_of(rendered_of(high, camera, step), 0.1) for step in range(2_000)])
+    assert_allclose(shears.std(axis=0), [0.1 * 40 / 2 / 2, 0.1 * 20 / 2 / 2], rtol=0.06)  # 2,000 draws: 1.6 %
+    assert np.abs(shears.mean(axis=0)).max() < 0.1 and abs(np.corrcoef(shears.T)[0, 1]) < 0.1
+    twice = np.array([shear_of(rendered_of(2 * high, camera, step), 0.1) for step in range(5)])
+    assert_allclose(twice, shears[:5] / 2, rtol=CLOSED_FORM)
+    assert shear_of(rendered_of(high, camera, 3), 0.1) == shear_of(rendered_of(high, camera, 3), 0.1)
+
+
+@pytest.fixture(scope="module")
+def plateau():
+    """An opaque, textured plane at 6 m of altitude, so that a shear moves what is seen, and changes nothing of it."""
+    truth = boxes.make_scene(0, n_points=4, size=16)
+    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
+    places = np.stack(np.meshgrid(*[np.linspace(-2, 2, 61)] * 2), axis=-1).reshape(-1, 2)
+    n = len(places)
+    waves = np.sin(3 * places[:, :1] + [0, 1, 2]) + np.cos(4 * places[:, 1:] + [0, 1, 2])
+    g = as_dtype(state.gaussians, np.float64)._replace(
+        means=np.column_stack([places, np.full(n, 6 / boxes.SCALE)]),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        log_scales=np.log(np.tile([0.05, 0.05, 1e-4], (n, 1))),
+        opacity_logits=np.full(n, 6.0),
+        sh_dc=0.3 * waves,
+        sh_rest=np.zeros((n, 0, 3)),
+    )
+    return Model(g, {RADIOMETRY: np.eye(3, 4)[None], IN_SHADOW: np.full((1, 3), 0.05)}), truth.scene
+
+
+CHANNELS = {"albedo": slice(3, 6), "altitude": slice(6, 7)}
+
+
+def consistency(monkeypatch, plateau, shift, change=lambda image: image):
+    """Return the loss of a view whose image is changed after it was rendered, by a shear that is given."""
+    (model, scene), request = plateau, Request(wants=frozenset(CHANNELS))
+    view = view_from(boxes.zenith(24))
+    output, _ = SATELLITE.render(model, view, request)
+    changed = output._replace(image=change(output.image))
+    monkeypatch.setattr("minisplat_ref.extensions.satellite.losses.shear_of", lambda *_: shift)
+    rendered = Rendered(changed, CHANNELS, view, scene, model, 1, request)
+    return view_consistency(rendered, altitude=0.01, color=0.1, noise=0.0, limit=1.0)[0]
+
+
+@pytest.mark.parametrize("shift", [(0.3, 0.0), (0.0, 0.3), (0.25, -0.35)])
+def test_views_of_a_plateau_agree(plateau, shift, monkeypatch):
+    """A pixel is found where the shear has moved it; two pixels beside, the loss is ten times as large."""
+    right = consistency(monkeypatch, plateau, shift)
+    wrong = consistency(monkeypatch, plateau, shift, lambda image: np.roll(image, 2, axis=(0, 1)))
+    assert 0 < 10 * right < wrong
+
+
+@pytest.mark.parametrize(
+    ("change", "value"),
+    [
+        ([0, 0, 0, 0.5], 0.01 * 0.5),
+        ([0.2, 0.2, 0.2, 0], 0.1 * 0.2),
+        ([0.3, 0, 0, 0], 0.1 * 0.1),
+        ([0.2, 0.2, 0.2, 1.5], 0.0),  # something hides it
+    ],
+)
+def test_weights_of_consistency_by_hand(plateau, change, value, monkeypatch):
+    """Without a shear, views differ by what is added: altitudes weigh 0.01, albedos 0.1 in the mean of the channels."""
+    added = np.array([0, 0, 0, *change])
+    assert consistency(monkeypatch, plateau, (0.0, 0.0), lambda image: image + added) == pytest.approx(
+        value, abs=CLOSED_FORM
+    )
+
+
+# --- surface models ---
+
+
+def test_a_tower_stands_in_its_cells(plateau):
+    """Of 36 x 24 cells over 2 x 2 units, x = 0.5 is in column 27, and y = 0.3, with north up, in row 8."""
+    model, _ = plateau
+    x, y, _ = model.gaussians.means.T
+    is_tower = (np.abs(x - 0.5) < 0.15) & (np.abs(y - 0.3) < 0.15)
+    means = np.where(is_tower[:, None], model.gaussians.means * [1, 1, 2], model.gaussians.means)
+    higher = model._replace(gaussians=model.gaussians._replace(means=means))
+    heights = surface_model(higher, (24, 36), boxes.SCALE)
+    assert heights[8, 27] == pytest.approx(12, abs=0.1) and heights[0, 0] == pytest.approx(6, abs=0.1)
+    rows, columns = np.nonzero(heights > 9)
+    assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [8.4, 27], atol=0.5)
+    wide = surface_model(higher, (24, 36), boxes.SCALE, half=4.0)  # there are Gaussians up to 2 units away
+    assert np.isnan(wide[:4]).all() and np.isnan(wide[:, -6:]).all() and wide[14, 16] == pytest.approx(6, abs=0.1)
+
+
+# --- the studies ---
+
+
+def terms_of(recipe):
+    return {term.name for term in recipe.losses}
+
+
+def test_an_arm_lacks_what_its_name_says():
+    scene, recipe = boxes.make_scene(0, 4, 8).scene, find_recipe("satellite", 100)
+    found = {arm: claims.arm_of(arm, recipe, scene) for arm in claims.ARMS}
+    assert found["all"] == (recipe, scene)
+    for name, term in (("sparsity", "opacity_sparsity"), ("view consistency", "view_consistency")):
+        assert terms_of(recipe) - terms_of(found[f"without {name}"][0]) == {term}
+    assert terms_of(recipe) - terms_of(found["without entropy"][0]) == {"shadow_entropy"}
+    assert all(view.camera.optics.coefficients for view in scene.train_views)
+    assert not any(view.camera.optics.coefficients for view in found["without shadows"][1].train_views)
+    changed = {arm: own for arm, (own, _) in found.items() if own != recipe}
+    assert set(claims.ARMS) - set(changed) == {"all", "without shadows", "limits 8 m below the ground"}
+    assert [arm for arm, own in changed.items() if not own.has_random_background] == ["a black background"]
+    assert [arm for arm, own in changed.items() if own.events != recipe.events] == ["an opaque start"]
+    assert len(changed["an opaque start"].events) == len(recipe.events) - 1
+    rates = changed["means at the rate of 3DGS"].learning_rates.of["means"]
+    assert (rates.first, rates.last, rates.steps) == (1.6e-4, 1.6e-6, 100)
+    still = changed["without radiometry"].representation.rates.of
+    assert (still[RADIOMETRY], still[IN_SHADOW]) == (0, 0.01)
+
+
+def test_the_truth_measures_as_it_should(monkeypatch):
+    """Heights that are all off by the same are no error; one of 64 pixels that is 6.4 m off is 0.1 m of it."""
+    truth = boxes.make_scene(1, n_points=60, size=8)
+    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
+    model = Model(as_dtype(state.gaussians, np.float64), {RADIOMETRY: truth.radiometry, IN_SHADOW: np.zeros((6, 3))})
+    heights = truth.heights + 5
+    heights[3, 3] += 6.4
+    monkeypatch.setattr(claims, "surface_model", lambda *_, **__: heights)
+    found, _ = claims.measure(model, truth)
+    assert found.height_mae == pytest.approx(0.1) and found.gain_error < 1e-12
+    doubled = model._replace(shared=model.shared | {RADIOMETRY: 2 * truth.radiometry})
+    assert claims.measure(doubled, truth)[0].gain_error < 1e-12  # relative to the first photograph
+    off = truth.radiometry + np.array([0, 0.1, 0, 0, 0, 0])[:, None, None]
+    gains = claims.measure(model._replace(shared=model.shared | {RADIOMETRY: off}), truth)[0].gain_error
+    assert gains == pytest.approx(0.1 / np.sqrt(5))  # one of five is off, in every entry
+
+
+def test_the_study_of_boxes_runs(tmp_path, monkeypatch, capsys):
+    for module, name, value in ((claims, "SIZE", 16), (claims, "N_POINTS", 60)):
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(claims, "make_scene", partial(boxes.make_scene, size=16))
+    command = ["study", "satellite/boxes", "--iterations", "2", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert all(said.count(f"| {arm} ") == 1 for arm in claims.ARMS)
+    heights = boxes.make_scene(0, size=16).heights
+    plane = np.abs(heights - np.median(heights)).mean()
+    assert f"a plane at the median height has an MAE of {plane:.2f} m" in said
+    maes = [float(line.split("|")[2]) for line in said.splitlines() if line.startswith("| ") and "height" not in line]
+    assert maes == sorted(maes, reverse=True)
+    assert np.load(tmp_path / "s" / "all.npy").shape == (16, 16)
+    drawn = claims.draw({"truth": heights, "high": np.full((2, 2), 12.0)})
+    shown = [ax.images[0].get_array() for ax in drawn.axes if ax.images]
+    assert len(shown) == 2 and shown[1].ravel().tolist() == [0.5] * 12  # of 24 m
+
+
+def test_the_study_of_distances_runs(tmp_path, capsys):
+    assert main(["study", "satellite/distance", "--out", str(tmp_path / "d")]) == 0
+    said = capsys.readouterr().out
+    at_nadir = {km: float(value) for km, angle, value in rows_of(said) if angle == "0"}
+    by_hand = {km: 353.5 / 0.3 * 50 / (1e3 * float(km)) for km in ("5", "50", "500")}  # as in test_satellite
+    assert at_nadir == pytest.approx(by_hand, rel=0.05)
+    assert sum(angle == "25" for _, angle, _ in rows_of(said)) == 3
+
+
+def rows_of(said):
+    """Return the cells of the table's rows."""
+    rows = [
+        [cell.strip() for cell in line.strip("| ").split("|")] for line in said.splitlines() if line.startswith("|")
+    ]
+    return rows[2:]
