@@ -25,7 +25,7 @@ from minisplat_ref.extensions.style.reference import (
 )
 from minisplat_ref.extensions.style.splitting import areas, children_of, cut_stretch, largest, split, split_large
 from minisplat_ref.extensions.style.stages import stages
-from minisplat_ref.extensions.style.styling import recolor
+from minisplat_ref.extensions.style.styling import read_style, recolor
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
 from minisplat_ref.oracle.gradients import jacobian_case
@@ -246,6 +246,15 @@ def test_a_run_with_more_than_gaussians_is_refused(folder, tmp_path, capsys):
     finally:
         (folder / "run" / "shared.npz").unlink()
     assert "has parameters besides its Gaussians" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
+def test_a_thin_style_keeps_a_pixel(tmp_path):
+    """100 x 1 pixels and 1 x 100, made ten times smaller; 60 x 30 keep their shape."""
+    for size, small in (((100, 1), (1, 10)), ((1, 100), (10, 1)), ((60, 30), (5, 10))):
+        Image.new("RGB", size, (10, 200, 30)).save(tmp_path / "thin.png")
+        found = read_style(tmp_path / "thin.png", 10)
+        assert found.shape == (*small, 3) and (found == [10, 200, 30]).all()
+    assert read_style(tmp_path / "thin.png", 60).shape == (30, 60, 3)
 
 
 def test_a_run_without_gaussians_is_refused(folder, tmp_path, capsys, monkeypatch):
