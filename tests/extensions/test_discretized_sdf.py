@@ -238,7 +238,7 @@ def small_study(monkeypatch):
         monkeypatch.setattr(study, name, value)
 
 
-def test_the_sphere_is_measured_as_it_says(small_study):
+def test_the_sphere_is_measured_as_it_says(small_study, monkeypatch):
     rng = np.random.default_rng(0)
     g, truths = study.noisy_sphere(rng), [study.trace(camera) for camera in study.cameras(rng, 2)]
     for truth in truths:
@@ -256,6 +256,11 @@ def test_the_sphere_is_measured_as_it_says(small_study):
     moved, logits = study.project_sphere(exact, truths, study.ARMS[0])
     assert_array_equal(moved.quats, g.quats)
     assert (moved.distances != exact.distances).any() and (logits < study.opacities(moved, WIDTH)).any()
+    monkeypatch.setattr(study, "STEPS", 1)  # the first step of Adam is as long as the rate, whatever the gradient
+    moved, _ = study.project_sphere(exact, truths, study.ARMS[2])
+    for name, rate in study.RATES.items():
+        steps = np.abs(getattr(moved, name) - getattr(exact, name))
+        assert_allclose(np.max(steps), rate, rtol=1e-6)
 
 
 def test_the_albedo_is_compared_up_to_a_factor(small_study):
