@@ -271,6 +271,8 @@ def test_the_rule_on_colours_by_hand():
     found = sky_masks.by_color(photograph(image), "")
     assert_array_equal(found, [[1, 1, 1, 0, 0], [1, 0, 1, 0, 0], [0, 0, 0, 0, 0]])
     assert not sky_masks.by_color(photograph(np.tile(np.array(ROOF), (2, 2, 1))), "").any()
+    lawn, bright_lamp = (90, 220, 200), (255, 235, 90)  # more green than blue; bright in two channels
+    assert not sky_masks.by_color(photograph(np.array([[lawn, bright_lamp]])), "").any()
 
 
 def test_masks_of_the_photograph_and_of_files(tmp_path):
@@ -285,6 +287,9 @@ def test_masks_of_the_photograph_and_of_files(tmp_path):
         sky_masks.from_files(view, "")
     with pytest.raises(InputError, match=r"b\.png: there is no such mask; minisplat-ref gaustudio masks SCENE"):
         sky_masks.from_files(view._replace(name="b"), str(tmp_path))
+    write_image(tmp_path / "d.png", np.tile(mask, (25, 26))[:, :103])
+    with pytest.raises(InputError, match=r"d\.png has 103 x 50 pixels"):  # 3 % wider than the photograph
+        sky_masks.from_files(view._replace(name="d"), str(tmp_path))
     write_image(tmp_path / "c.png", large[:4])
     with pytest.raises(InputError, match=r"c\.png has 16 x 4 pixels, which is not the shape of the photograph, 4 x 2"):
         sky_masks.from_files(view._replace(name="c"), str(tmp_path))
@@ -314,6 +319,9 @@ def test_initialisers(scene, rng, monkeypatch):
     boxed = initialisers.box(g, scene, rng)
     low, high = np.quantile(g.means, [0.02, 0.98], axis=0)
     assert boxed.means.shape == g.means.shape and np.all((boxed.means >= low) & (boxed.means <= high))
+    many = initialisers.box(make_gaussians(rng, 2_000), scene, rng).means
+    wide = np.quantile(make_gaussians(rng, 2_000).means, [0.02, 0.98], axis=0)
+    assert_allclose(np.ptp(many, axis=0), wide[1] - wide[0], rtol=0.15)  # of other 2,000: 96 % of the points
     assert not boxed.sh_dc.any() and boxed.sh_rest.shape == g.sh_rest.shape and not np.isin(boxed.means, g.means).any()
     few = type(g)(*(field[:2] for field in g))
     assert initialisers.planes(few, scene, rng) is None and initialisers.box(few, scene, rng) is None

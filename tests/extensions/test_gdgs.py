@@ -182,6 +182,20 @@ def test_control_clones_where_gradients_are_large_and_density_is_uneven(monkeypa
     assert "gradient_sum" not in state.stats
 
 
+def test_clones_lie_a_tenth_of_a_deviation_away(monkeypatch):
+    """Of 400 Gaussians in one octant, deviations of e^-1, e^-1 and e^-3: the mean square of what clones move."""
+    state, edits = State(gaussians_at(np.full((400, 3), 0.4)), np.ones(400)), []
+    monkeypatch.setattr(method, "apply_edit", lambda state, edit: edits.append(edit))
+    iteration = rendered(np.array([[0.0, 0, 0], [2, 2, 2]]), None, 1)
+    control_by_region(state, iteration, threshold=0.5, n_cells=1, min_unevenness=1.0, jitter=0.1)
+    moved = edits[0].gaussians.means[400:] - 0.4
+    assert_allclose(moved.std(axis=0), 0.1 * np.exp([-1, -1, -3]), rtol=0.15)  # 400 draws: 3.5 %
+
+
+def test_repulsion_reaches_an_eighth_of_a_region():
+    assert method.spacing_of(Regions(np.zeros(3), 2.0, (1, 1, 1))) == 0.25
+
+
 def test_the_recipe_trains_through_the_command_line(tmp_path):
     tiny = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *tiny]) == 0

@@ -199,6 +199,31 @@ def test_flow_of_nothing(texture):
     assert found.is_known.mean() > 0.9 and not found.motion.any()
 
 
+def test_bytes_and_shares_have_the_same_flow(texture):
+    first, second = (np.round(255 * image).astype(np.uint8) for image in (texture, shift(texture, (0, 1, 0), order=1)))
+    as_bytes, as_shares = optical_flow(first, second), optical_flow(first / 255, second / 255)
+    assert_array_equal(as_bytes.is_known, as_shares.is_known)
+    assert_allclose(as_bytes.motion, as_shares.motion, atol=1e-9)
+
+
+def test_what_does_not_come_back_has_no_flow(texture):
+    """Half of the second photograph shows something else: there is a flow, and it does not return."""
+    other = gaussian_filter(np.random.default_rng(7).uniform(size=texture.shape), (2.5, 2.5, 0))
+    second = texture.copy()
+    second[:, 32:] = ((other - other.min()) / np.ptp(other))[:, 32:]
+    is_known = optical_flow(texture, second).is_known
+    assert is_known[8:-8, 4:20].mean() > 0.9 > 0.5 > is_known[8:-8, 44:-4].mean()
+
+
+def test_a_lone_pixel_does_not_spoil_the_flow(texture, monkeypatch):
+    """The median of 3 x 3 pixels takes out what one window got wrong."""
+    steps = np.zeros((5, 5, 2))
+    steps[2, 2] = 1.0
+    monkeypatch.setattr(pyramid, "_step", lambda first, moved: steps)
+    monkeypatch.setattr(pyramid, "N_STEPS", 1)
+    assert not pyramid._flow(texture[:5, :5], texture[:5, :5]).any()
+
+
 # --- rendered flow ---
 
 

@@ -20,6 +20,7 @@ from minisplat_ref.extensions.vdgs.method import (
     TABLE,
     VIEW_DEPENDENT,
     as_seen,
+    levels_of,
     n_outputs,
 )
 from minisplat_ref.extensions.vdgs.reference import (
@@ -201,6 +202,14 @@ def test_the_place_of_a_scene_without_points(rng):
     nothing = Scene("a", (), (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(3), extent=4.0)
     shared = VIEW_DEPENDENT.shared(nothing, rng)
     assert shared[RADIUS].tolist() == [4.0] and shared[CENTER].tolist() == [0, 0, 0]
+    x = np.array([*range(-5, 5), 1000.0])  # the median is 0; eight of ten others are within 4, a ninth at 5
+    points = np.stack([x, np.zeros(11), np.full(11, 2.0)], axis=1)
+    shared = VIEW_DEPENDENT.shared(nothing._replace(points=points), rng)
+    assert shared[CENTER].tolist() == [0, 0, 2] and shared[RADIUS].tolist() == [5.0]
+
+
+def test_cells_from_16_to_128():
+    assert levels_of(np.zeros((4, 2**12, 2))).resolutions == (16, 32, 64, 128)
 
 
 # Runs and studies

@@ -325,6 +325,7 @@ def test_what_is_too_steep_is_tilted_back():
     slopes = np.linalg.norm(normals[:, :2], axis=1) / np.abs(normals[:, 2])
     assert placed.n_steep == 1
     assert_allclose(slopes.max(), 1.5, rtol=1e-9)
+    assert put(oblique, steepest=1e6).n_steep == 0
 
 
 def test_balls_are_counted_as_no_discs():
@@ -337,4 +338,27 @@ def test_nothing_in_front_of_the_camera_is_refused():
     behind = discs([[0, 0, -1], [9, 0, 1]], [[1, 0, 0, 0]] * 2, [[0.01, 0.01]] * 2)
     with pytest.raises(InputError, match="none of the 2 Gaussians is in front of the camera"):
         put(behind)
-    assert len(put(discs([[0, 0, 3]], [[1, 0, 0, 0]], [[0.01, 0.01]])).scene.opacities) == 1  # one depth is enough
+    alone = put(discs([[0, 0, 3]], [[1, 0, 0, 0]], [[0.01, 0.01]]))  # one depth is enough
+    assert len(alone.scene.opacities) == 1 and (alone.box.nearest, alone.box.farthest) == pytest.approx((1.5, 6.0))
+
+
+def test_the_box_leaves_out_what_hardly_shows():
+    """Discs of one size at depths 1, 2 and 10 show 1, 1/4 and 1/100 of the first: less than a hundredth of all."""
+    box = put(discs([[0, 0, 1], [0, 0, 2], [0, 0, 10]], [[1, 0, 0, 0]] * 3, [[0.05, 0.05]] * 3)).box
+    assert (box.nearest, box.farthest) == (1, 2)
+    box = put(discs([[0, 0, 1], [0, 0, 2], [0, 0, 10]], [[1, 0, 0, 0]] * 3, [[0.05, 0.05]] * 2 + [[0.1, 0.1]])).box
+    assert (box.nearest, box.farthest) == (1, 10)
+
+
+def test_what_reaches_into_the_image_is_seen():
+    """At depth 1 the image ends at 0.48: a disc of deviation 0.01 reaches 0.03 further, and below it ends at 0.32."""
+    for place_of, n_seen in (
+        ((0.50, 0), 1),
+        ((-0.50, 0), 1),
+        ((0.52, 0), 0),
+        ((0, 0.34), 1),
+        ((0, -0.34), 1),
+        ((0, -0.36), 0),
+    ):
+        placed = put(discs([[0, 0, 1], [*place_of, 1]], [[1, 0, 0, 0]] * 2, [[0.01, 0.01]] * 2))
+        assert len(placed.scene.opacities) == 1 + n_seen, place_of
