@@ -153,6 +153,12 @@ def test_mirrors_grow_and_others_are_disturbed(rng):
     assert (np.abs(after.quats[[1, 2]] - g.quats[[1, 2]]) > 0).all()
     mean = g.albedo_logits.mean(axis=0)
     assert_allclose(after.albedo_logits[2], 0.9 * g.albedo_logits[2] + 0.1 * mean, rtol=1e-12)
+    crowd = reflective(make_gaussians(rng, 400))._replace(quats=np.tile([1.0, 0, 0, 0], (400, 1)))
+    many = _State(
+        crowd._replace(metallic_logits=np.where(np.arange(400) < 1, 2.0, -2.0), roughness_logits=np.full(400, -3.0))
+    )
+    spread_normals(many, None, **settings)
+    assert_allclose((many.gaussians.quats[1:] - [1, 0, 0, 0]).std(axis=0), 0.1, rtol=0.15)  # 399 draws: 3.5 %
     dull = _State(g._replace(metallic_logits=np.full(4, -2.0)))
     assert spread_normals(dull, None, **settings) == "nothing done: no surfel mirrors"
     shade_by(state, None, stage=2)

@@ -153,6 +153,17 @@ def test_a_wrong_depth_of_the_source_shows_as_much():
     trip = round_trip(*views)
     assert_allclose(trip.depth_error[trip.is_seen], 0.1, rtol=1e-10)
     assert_allclose(trip.pixel_error[trip.is_seen], 20 * 0.5 * (1 / 2 - 1 / 2.2), rtol=1e-10)
+    for pixels, agrees in ((0.44, False), (0.46, True)):  # 0.4545
+        found = agree(views[0], views[1:], Tolerances(pixels=pixels, depth=1.0, n_views=1))
+        assert found.n_agreeing.any() == agrees
+
+
+def test_a_point_behind_the_reference_is_not_seen():
+    """A source 3 units behind says that the surface is 1 before itself, which is 2 behind the reference."""
+    behind = camera_at(0.0)._replace(cam_from_world_t=np.array([0.0, 0, 3]))
+    reference, source = DepthView(np.full((18, 24), 2.0), camera_at(0.0)), DepthView(np.full((18, 24), 1.0), behind)
+    assert not round_trip(reference, source).is_seen.any()
+    assert round_trip(reference, source._replace(depth=np.full((18, 24), 5.0))).is_seen.any()
 
 
 def test_what_views_agree_on():

@@ -36,6 +36,8 @@ def test_brightness_is_a_color_and_no_edge():
         assert_allclose(map_[..., :3], 0.6, rtol=CLOSED_FORM)
         assert np.abs(map_[..., EVEN]).max() < 1e-12
         assert_allclose(map_[..., -1], 0.5)
+        assert_allclose(map_[..., ENERGY], 0.02, rtol=1e-6)  # the floor
+    assert [map_.shape[:2] for map_ in maps] == [(21, 21), (16, 16), (3, 3)]  # of 48, 22 and 9 pixels, filters of 7
 
 
 def test_halving_keeps_a_constant_and_halves_the_size():

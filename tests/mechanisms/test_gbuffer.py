@@ -189,6 +189,7 @@ def test_tone_is_that_of_srgb_and_has_no_end():
     found = tone(linear)
     assert_allclose(found[:3], [0.02584, 0.7353569830524495, 1.0], rtol=1e-12)
     assert found[3] > 1.8
+    assert_allclose(tone(np.array([0.0035])), 1.055 * 0.0035 ** (1 / 2.4) - 0.055, rtol=1e-12)  # just past the knee
     assert_allclose(untone(found), linear, rtol=1e-12)
     numeric = (tone(linear + 1e-6) - tone(linear - 1e-6)) / 2e-6
     assert_allclose(tone_vjp(linear, np.ones(4)), numeric, rtol=1e-6)

@@ -36,6 +36,7 @@ def test_what_is_missing_is_incomplete_and_not_inaccurate():
     assert found.f_score == pytest.approx(2 * 0.6 / 1.6)
     turned = compare_surfaces(grid(1, 0.0), grid(0.5, 0.0), tau=0.1 + 1e-9)
     assert (turned.accuracy, turned.completeness) == (found.completeness, 0.0)
+    assert turned.f_score == found.f_score
 
 
 def test_points_are_drawn_uniformly_by_area(rng):
