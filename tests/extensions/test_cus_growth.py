@@ -173,6 +173,22 @@ def test_the_state_grows(scene, state):
     assert len(state.gaussians.means) == n + len(new)
 
 
+def test_growth_is_by_the_mean_over_the_views_that_saw_a_gaussian(scene, state, monkeypatch):
+    """Two of five views saw the first Gaussian, none the second."""
+    n, asked = len(state.gaussians.means), []
+
+    def remembered(anchors, gradients, side, threshold, rng):
+        asked.append(gradients)
+        return grow(anchors, np.zeros_like(gradients), side, 1.0, rng)
+
+    monkeypatch.setattr(growth, "grow", remembered)
+    sums, counts = np.zeros((n, 2)), np.zeros((n, 2), int)
+    sums[0, 0], counts[0, 0] = 3.0, 2
+    state.stats |= {SUM: sums, COUNT: counts}
+    grow_anchors(state, iteration_of(scene, None), voxel=1.0, growth_threshold=1e-3)
+    assert asked[0][0, 0] == 1.5 and np.isnan(asked[0][0, 1])
+
+
 def test_dates_by_hand():
     """As in the release: from 1,500 to 15,000 of 30,000, every hundredth; a short run leaves a hundred in between."""
     recipe = find_recipe("cus", 30_000)

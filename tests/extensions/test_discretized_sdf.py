@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.discretized_sdf import EXTENSION, losses, study
+from minisplat_ref.extensions.discretized_sdf import EXTENSION, losses, population, study
 from minisplat_ref.extensions.discretized_sdf.method import (
     DISTANCED,
     RECIPE,
@@ -110,6 +110,8 @@ def test_a_start_on_the_sphere(rng):
     assert (found.distances > 0).any() and (found.distances < 0).any()
     none = with_distances(gaussians, rng, foreground=0.0)
     assert_array_equal(none.means, gaussians.means)
+    rows, _, _ = population._foreground(gaussians.means[:7], 0.4)
+    assert len(rows) == 3  # of 2.8
 
 
 def rendered_of(means, distances, depth=2.0, width=8, height=6, **changed):
@@ -134,6 +136,8 @@ def test_the_projection_by_hand():
     assert_allclose(v.gaussians["means"][:, 2], [0.5, -0.5, 0, 0, 0])
     assert_allclose(v.gaussians["distances"], [-0.5, 0.5, 0, 0, 0])
     assert not v.gaussians["quats"][2:].any()
+    near = rendered_of([[0, 0, 0.009], [0, 0, 0.011]], [0.0, 0.0], depth=0.05)  # what touches the camera has no pixel
+    assert_allclose(losses.rendered_depths(near), [0, 0.05], rtol=1e-6)
     nothing, v = losses.projection(rendered_of(means[3:], [0.0, 0.0]), reach=0.1)
     assert nothing == 0 and not v.gaussians
 
@@ -169,6 +173,10 @@ def test_the_silhouette_by_hand():
     value, v = losses.silhouette(masked)
     assert_allclose(value, -(np.log(0.9) + np.log(0.8)) / 2, rtol=1e-12)
     assert_allclose(v.alpha[0, [0, 7]], [-1 / 0.9 / 48, 1 / 0.8 / 48], rtol=1e-12)
+    thin = masked._replace(output=rendered.output._replace(alpha=np.where(mask, 1.0, 1e-5)))
+    value, v = losses.silhouette(thin)  # beyond the margin of 1e-6 there is neither an infinite loss nor a slope
+    assert_allclose(value, -(np.log(1 - 1e-6) + np.log(1 - 1e-5)) / 2, rtol=1e-6)
+    assert v.alpha[0, 0] == 0 and v.alpha[0, 7] > 0
 
 
 def test_density_control_by_distance(rng):

@@ -13,7 +13,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite import affine_fit, boxes, reference, rpc, utm
 from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
-from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference
+from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference, hold_sky
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.extensions.satellite.stages import stages
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
@@ -423,6 +423,13 @@ def test_boxes_truth():
     assert heights[48, 48] == pytest.approx(12) and heights[48, 60] == pytest.approx(0)
     dark = np.flatnonzero(is_shadow[48])
     assert (dark[0], dark[-1]) == (58, 69)  # pixels of a metre: x from 10 to 22 m
+
+
+def test_light_in_shadows_stays_between_none_and_the_sun_s():
+    state = initial_state(boxes.make_scene(0, n_points=8, size=4).scene, find_recipe("satellite", 10), 0)
+    state.shared[IN_SHADOW][:2] = [[-0.1, 0.3, 1.7], [0.0, 1.0, 2.0]]
+    hold_sky(state, None)
+    assert_allclose(state.shared[IN_SHADOW][:2], [[0, 0.3, 1], [0, 1, 1]], rtol=1e-6)
 
 
 def test_a_transparent_start():

@@ -1,6 +1,7 @@
 """G-Style: colours, areas and grids by hand, gradients of losses and features, and a run that is painted."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -170,6 +171,39 @@ def test_only_the_largest_above_the_threshold_are_split():
 def test_stretch_is_cut_at_the_second_axis():
     found = np.exp(cut_stretch(np.log([[0.8, 0.1, 0.2], [0.25, 0.2, 0.1]]), 1.5))
     assert_allclose(found, [[0.3, 0.1, 0.2], [0.25, 0.2, 0.1]], rtol=CLOSED_FORM)
+
+
+def test_colours_split_where_the_length_of_their_gradient_is_largest(monkeypatch):
+    """Second moments of three channels: sums of 3, 2.9 and 4, the largest ones of a channel 1, 2.9 and 4."""
+    g = make_gaussians(np.random.default_rng(0), 3)
+    moments = np.array([[1.0, 1, 1], [2.9, 0, 0], [4.0, 0, 0]])
+    state = SimpleNamespace(gaussians=g, adam=SimpleNamespace(second=SimpleNamespace(sh_dc=moments)))
+    edits = []
+    monkeypatch.setattr(method, "apply_edit", lambda state, edit: edits.append(edit))
+    assert method.split_by_color_gradient(state, None, max_share=0.7, n_children=4) is None
+    assert set(edits[0].parent_ids[edits[0].is_new]) == {0, 2}
+    moments[:] = 0
+    assert "no colour" in method.split_by_color_gradient(state, None, max_share=0.7, n_children=4)
+
+
+def test_rows_of_a_style_are_spread_evenly():
+    rows = np.arange(5_000)
+    found = method.evenly(rows)
+    assert len(found) == 2_000 and found[0] == 0 and found[-1] == 4_997 and set(np.diff(found)) == {2, 3}
+    assert_array_equal(method.evenly(rows[:10]), rows[:10])
+
+
+def test_the_content_is_that_of_the_photograph():
+    """A rendering that is the photograph has no error of its content, and none where the style weighs nothing."""
+    image = np.random.default_rng(0).integers(0, 256, (48, 48, 3)).astype(np.uint8)
+    style = method.style_of(CLASSICAL, image / 255)
+    rendered = SimpleNamespace(channel=lambda name: image / 255, view=SimpleNamespace(image=image))
+    for weight, is_some in ((0.0, False), (1.0, True)):
+        weights = FeatureWeights(weight, 5.0)
+        value, _ = method.style_features(
+            rendered, style=style._replace(maps=tuple(-m for m in style.maps)), weights=weights
+        )
+        assert (value > 1e-12) == is_some
 
 
 def test_published_rounds_and_shares():
