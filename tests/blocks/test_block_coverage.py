@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from minisplat_ref.blocks import coverage as coverage_module
 from minisplat_ref.blocks.coverage import SHARE_MIN, Coarse, cover, shows
 from minisplat_ref.blocks.grid import Block
 from minisplat_ref.errors import InputError
@@ -47,6 +48,20 @@ def test_a_photograph_belongs_to_the_blocks_that_it_shows():
     columns = coverage.masks[0]["v1"].all(axis=0)  # of 20, each a tenth of a unit wide
     assert columns[:10].all() and not coverage.masks[0]["v1"][:, 13:].any()
     assert 0.05 < SHARE_MIN < 0.5
+
+
+@pytest.mark.parametrize(("n_columns", "belongs"), [(5, True), (4, False)])
+def test_a_quarter_of_the_pixels_is_enough(n_columns, belongs, monkeypatch):
+    """Of 20 columns five show the left region, or four."""
+    ids = np.zeros((10, 20), int)
+    ids[:, n_columns:] = 1
+    monkeypatch.setattr(coverage_module, "_dominant", lambda coarse, view: ids)
+    two = screen([[-1.0, 0, 2], [1.0, 0, 2]])
+    masks, _ = cover(two, scene_of(looking_at(0), looking_at(0)), PLANE, [LEFT] if belongs else [RIGHT])
+    assert len(masks[0]) == 2
+    if not belongs:
+        with pytest.raises(InputError, match="block 0-0 has 0 photographs of which 25% show it"):
+            cover(two, scene_of(looking_at(0), looking_at(0)), PLANE, [LEFT])
 
 
 def test_pixels_without_gaussians_belong_to_all_blocks_of_the_photograph():

@@ -66,10 +66,12 @@ def test_a_region_is_a_fifth_wider_on_each_side():
     ("xy", "shape", "why"),
     [
         ([[0.0, 0.0], [1.0, 1.0]], (3, 1), "2 cameras for 3 blocks"),
+        ([[0.0, 0.0], [1.0, 1.0]], (5, 1), "2 cameras for 5 blocks"),
         ([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], (2, 2), "1 cameras for 2 blocks"),
         ([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]], (1, 2), "stand side by side"),
     ],
 )
 def test_what_cannot_be_divided(xy, shape, why):
-    with pytest.raises(InputError, match=rf"--blocks {shape[0]}x{shape[1]} cannot be made, .*{why}"):
+    fewer = f"give fewer, such as {'2x1' if shape[0] > 3 else '1x1'}"
+    with pytest.raises(InputError, match=rf"--blocks {shape[0]}x{shape[1]} cannot be made, .*{why}.*: {fewer}"):
         divide(np.array(xy), shape)
