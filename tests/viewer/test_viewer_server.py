@@ -5,6 +5,7 @@ import socket
 import sys
 import time
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,9 +22,11 @@ from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.runs.scoring import Trained
 from minisplat_ref.types import Model
 from minisplat_ref.viewer import browser as browser_module
+from minisplat_ref.viewer import live
 from minisplat_ref.viewer.browser import HOST, Content, Viewer, address, open_server
 from minisplat_ref.viewer.layers import draw
-from minisplat_ref.viewer.poses import Pose, camera_of
+from minisplat_ref.viewer.poses import Pose, camera_of, pose_of
+from minisplat_ref.viewer.progression import Wanted
 from run_commands import OPTIONS, SCENE, contents, refused  # noqa: F401  (a fixture)
 from scenes import as_dtype, balls
 
@@ -115,6 +118,66 @@ def test_layers_and_cameras_are_chosen_in_the_panel(server):
         messages = until(viewer, client, lambda m: any(x["type"] == "CameraFrustumMessage" for x in m))
         (shown,) = [message for message in messages if message["type"] == "CameraFrustumMessage"]
         assert shown["props"]["fov"] == pytest.approx(AHEAD.fov) and shown["props"]["_image_data"]
+
+
+def test_cameras_are_hidden_again_and_a_click_goes_there(server, monkeypatch):
+    handles, clicks = [], []
+
+    def frustum(name, fov, aspect, **drawn):
+        handles.append(SimpleNamespace(visible=None, aspect=aspect, on_click=clicks.append, **drawn))
+        return handles[-1]
+
+    monkeypatch.setattr(server.scene, "add_camera_frustum", frustum)
+    aside = AHEAD._replace(position=(0.4, 0.0, 0.0), fov=0.7)
+    wide = camera_of(aside, *SIZE)._replace(fy=2 * camera_of(aside, *SIZE).fx)
+    viewer = Viewer(server, content(cameras=[Viewpoint("0001", wide, "train", 0.0)]))
+    for is_shown in (True, False, True):
+        viewer._show_cameras(is_shown)
+        assert [handle.visible for handle in handles] == [is_shown]
+    assert handles[0].aspect == pytest.approx(2 * 4 / 3) and handles[0].image.shape == (12, 16, 3)
+    there = SimpleNamespace(wxyz=None, position=None, fov=None)
+    clicks[0](SimpleNamespace(client=SimpleNamespace(camera=there, atomic=contextlib.nullcontext)))
+    expected = pose_of(wide, 0.0)
+    assert (there.wxyz, there.position, there.fov) == (expected.wxyz, expected.position, expected.fov)
+    assert there.position == pytest.approx((0.4, 0, 0))
+
+
+def test_a_window_remembers_since_when_it_wants_something(monkeypatch):
+    now = iter([5.0, 9.0])
+    monkeypatch.setattr(browser_module.time, "perf_counter", lambda: next(now))
+    window, wanted = browser_module._Window(), Wanted(AHEAD, "colour", *SIZE)
+    window.want(wanted)
+    window.want(wanted)
+    assert window.since == 5
+    window.want(wanted._replace(layer="depth"))
+    assert window.since == 9
+
+
+def test_the_clock_of_a_training_stands_still_while_a_frame_is_drawn(monkeypatch):
+    """All that the viewer does, its making included, is done while the progress is paused."""
+    is_paused, done = [False], []
+
+    @contextlib.contextmanager
+    def paused():
+        is_paused[0] = True
+        yield
+        is_paused[0] = False
+
+    class Watched:
+        def __init__(self, server, content):
+            done.append(is_paused[0])
+
+        def __getattr__(self, name):
+            return lambda *_: done.append(is_paused[0])
+
+    monkeypatch.setattr(live, "Viewer", Watched)
+    monkeypatch.setattr(live, "renderer_of", lambda settings, model: SPLATTING)
+    scene = make_scene("room", n_views=3, width=16, height=12, supersampling=1, n_points=20).scene
+    settings, progress = SimpleNamespace(profile="GSPLAT_MAIN", backend="cpu"), SimpleNamespace(paused=paused)
+    on_step = live.make_live_view(None)(None, scene, settings, progress)
+    report = SimpleNamespace(state=SimpleNamespace(model=trained().model), step=1, last_step=2)
+    on_step(report)
+    assert done == [True] * 4 and not is_paused[0]  # made, shown, said, drawn
 
 
 def test_a_layer_that_cannot_be_drawn_says_why(server):
