@@ -124,6 +124,8 @@ def test_opacity_in_a_mask_by_hand():
     alpha = np.array([[0.5, 0.25], [1.0, 0.0]])
     value, v = opacity_in(alpha, np.array([[True, True], [False, False]]))
     assert value == 0.375 and v.tolist() == [[0.5, 0.5], [0, 0]]
+    value, v = opacity_in(alpha, np.array([[True, True], [True, False]]))
+    assert value == pytest.approx(1.75 / 3) and v.tolist() == [[1 / 3, 1 / 3], [1 / 3, 0]]
     value, v = opacity_in(alpha, np.zeros((2, 2), bool))
     assert value == 0 and not v.any()
 
@@ -374,6 +376,12 @@ def test_density_modules(monkeypatch, rng, scene):
     assert halved.parent_ids.tolist() == [0, 1, 2, 0, 1] and len(halved.gaussians.means) == 5
     assert len(cloned.gaussians.means) == 5
     assert np.sort(np.exp(cloned.gaussians.log_scales).max(axis=1))[-1] < 0.5, "the large one was split"
+    for size, n_as_large in ((0.02, 0), (0.005, 2)):  # above a hundredth of the extent, 1, it is split, else cloned
+        state = State(rng)
+        state.gaussians.log_scales[0] = np.log(size * context.scene.extent)
+        densities.clones(state, context)
+        scales = np.exp(edits[-1].gaussians.log_scales[:, 0])
+        assert np.count_nonzero(np.isclose(scales, size * context.scene.extent)) == n_as_large, size
 
 
 # One stage at a time

@@ -15,7 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.lucas_kanade import body as bodies
-from minisplat_ref.extensions.lucas_kanade import pyramid, study
+from minisplat_ref.extensions.lucas_kanade import losses, pyramid, study
 from minisplat_ref.extensions.lucas_kanade.losses import depth_order, flow, next_view, ordered_pairs, rendered_flow
 from minisplat_ref.extensions.lucas_kanade.method import WARPED, first_warp
 from minisplat_ref.extensions.lucas_kanade.moving import CENTERS, GROWTHS, LOG_WIDTH, SHIFTS, TURNS, moved
@@ -43,7 +43,7 @@ from minisplat_ref.rendering import SPLATTING, Request, activate
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
-from scenes import as_dtype, make_camera, make_gaussians
+from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE
 
 RENDERER = WARPED.renderer
@@ -124,6 +124,15 @@ def test_gradients_of_the_formulas(rng):
     )
 
 
+def test_what_the_next_camera_does_not_see_in_front_of_it_counts_as_still():
+    """Three balls that the first camera sees; the second has them at -1, 0.005 and 0.5 before itself."""
+    g = balls([[0, 0, 2], [0.3, 0, 2], [-0.3, 0, 2]], [0.1] * 3, [0.5] * 3)
+    after = np.array([[0.0, 0, -1], [0.3, 0, 0.005], [-0.3, 0, 0.5]])
+    camera = make_camera(24, 18)
+    _, _, rows = losses.blended_steps(g, after, (camera, camera), Request(backend=REFERENCE))
+    assert rows.tolist() == [2]
+
+
 def test_losses_by_hand():
     """A pixel with F = (3, -1), A = 0.5 and f = (4, 2) misses by (1, -2); the other's flow is unknown. Width 2."""
     motion, alpha = np.array([[[3.0, -1], [9, 9]]]), np.array([[0.5, 1]])
@@ -138,6 +147,16 @@ def test_losses_by_hand():
     left, right = np.array([[0, 0]]), np.array([[0, 1]])
     assert order_error(sums, alpha, Pairs(left, right), 0.1) == 0
     assert order_error(sums, alpha, Pairs(right, left), 0.1) == pytest.approx(0.1 + np.log(1.5))
+
+
+def test_pairs_of_a_twentieth_of_the_range_have_an_order():
+    """Depths of 0, 0.05 and 1: each of the three differs from each other by more than 0.02 of the range."""
+    pixels, given = np.array([[0, 0], [1, 1], [2, 2]]), np.array([0.0, 0.05, 1.0])
+    found = set()
+    for seed in range(20):
+        pairs = ordered_pairs(pixels, given, np.random.default_rng(seed))
+        found |= {(int(a[0]), int(b[0])) for a, b in zip(pairs.near, pairs.far, strict=True)}
+    assert found == {(0, 1), (0, 2), (1, 2)}
 
 
 def test_pairs_are_ordered():
@@ -389,6 +408,56 @@ def test_given_flows(rng, tmp_path):
     other = rendered._replace(view=view._replace(name="other"))
     assert flow(other, flows=str(tmp_path))[0] > 0.01
     assert flow(other._replace(view=other.view._replace(mask=hidden)), flows=str(tmp_path))[0] < 1e-12
+
+
+def test_a_motion_along_one_axis_alone_is_unknown(rng, tmp_path):
+    view = tiny_scene(rng).train_views[0]
+    given = np.zeros((18, 24, 2))
+    given[4, 5, 0] = given[6, 7, 1] = np.nan
+    np.save(tmp_path / "view0.npy", given)
+    known = losses._given_flow(tmp_path, view)
+    assert np.argwhere(~known.is_known).tolist() == [[4, 5], [6, 7]] and np.isfinite(known.motion).all()
+
+
+def test_a_lone_photograph_is_taken_to_look_the_same_a_unit_of_time_later(rng, monkeypatch):
+    scene, asked = tiny_scene(rng, times=(0.25,)), []
+
+    def remembered(model, view, other, request):
+        asked.append((view.time, other.time))
+        return rendered_flow(model, view, other, request)
+
+    monkeypatch.setattr(losses, "rendered_flow", remembered)
+    flow(rendered_view(scene, warped(make_gaussians(rng, 30), rng)), flows="")
+    assert asked == [(0.25, 1.25)]
+
+
+def test_depths_are_compared_where_the_image_is_opaque_and_not_masked(rng, tmp_path, monkeypatch):
+    """Half of the pixels have an alpha of 0.6, half of 0.4; the mask leaves the upper rows. 1,024 are drawn at most."""
+    scene, model = tiny_scene(rng), warped(make_gaussians(rng, 30), rng)
+    rendered, compared = rendered_view(scene, model), []
+    alpha = np.where(np.arange(24) < 12, 0.6, 0.4) * np.ones((18, 1))
+    mask = np.arange(18)[:, None] * np.ones((1, 24)) < 9
+    monkeypatch.setattr(losses, "ordered_pairs", lambda *given: compared.append(given[0]) or ordered_pairs(*given))
+    np.save(tmp_path / "view0.npy", rng.uniform(size=(18, 24)))
+    seen = rendered._replace(output=rendered.output._replace(alpha=alpha), view=rendered.view._replace(mask=mask))
+    depth_order(seen, depths=str(tmp_path), margin=0.0)
+    rows, columns = compared[0].T
+    assert len(rows) == 9 * 12 and rows.max() == 8 and columns.max() == 11
+    large = scene.train_views[0]._replace(name="large", camera=make_camera(40, 30))
+    np.save(tmp_path / "large.npy", rng.uniform(size=(30, 40)))
+    pixels, depths = losses._map_samples(tmp_path, large, rng)
+    assert len(pixels) == len(depths) == len(np.unique(pixels, axis=0)) == 1_024
+
+
+def test_sparse_points_are_at_rows_and_columns(rng):
+    """Of a camera of 24 x 18 pixels, f = 20, a point at (0.5, 0.2, 2) is in column 12 + 5 and row 9 + 2."""
+    scene = tiny_scene(rng)
+    camera = make_camera(24, 18, fx=20.0, fy=20.0)._replace(cx=12.0, cy=9.0)
+    view = scene.train_views[0]._replace(camera=camera, point_ids=np.array([0]))
+    placed = scene._replace(points=np.array([[0.5, 0.2, 2.0]]))
+    rendered = rendered_view(scene, warped(make_gaussians(rng, 30), rng))._replace(scene=placed, view=view)
+    pixels, depths = losses._point_samples(rendered)
+    assert pixels.tolist() == [[11, 17]] and depths.tolist() == [2.0]
 
 
 @pytest.mark.parametrize("fault", ["missing", "shape", "text"])

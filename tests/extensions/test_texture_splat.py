@@ -272,7 +272,8 @@ def test_a_weighted_mean_by_hand(rng):
     albedo = rng.uniform(0.2, 0.8, size=(24, 32, 3))
     is_known = rng.uniform(size=(24, 32)) < 0.5
     normals = np.broadcast_to([0.0, 0.6, -0.8], (24, 32, 3))
-    maps = Maps(camera, normals, np.concatenate([albedo, np.full((24, 32, 2), 0.25)], axis=2), is_known)
+    shares = np.broadcast_to([0.25, 0.7], (24, 32, 2))
+    maps = Maps(camera, normals, np.concatenate([albedo, shares], axis=2), is_known)
     output, _ = TEXTURED.render(model_of(disc), view_from(camera), Request(backend=REFERENCE))
     weights = np.where(is_known, output.alpha, 0)
     expected = np.einsum("yx,yxc->c", weights, albedo) / weights.sum()
@@ -280,6 +281,7 @@ def test_a_weighted_mean_by_hand(rng):
         found = bake(disc, [maps], steps=0, backend=backend)
         assert_allclose(sigmoid(found.albedo_logits)[0], expected, rtol=1e-9)
         assert_allclose(sigmoid(found.metallic_logits), 0.25, rtol=1e-9)
+        assert_allclose(sigmoid(found.roughness_logits), 0.7, rtol=1e-9)
         # The disc's normal is +z, away from the camera, so its texture holds the opposite of what is seen.
         assert_allclose(tangent_normals(found.normal_textures)[0], [0, -0.6, 0.8], atol=1e-9)
 
