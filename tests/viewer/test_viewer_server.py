@@ -103,7 +103,7 @@ def test_a_frame_comes_coarse_then_full_and_follows_the_camera(server):
 
         viewer.show(trained(color=(0.1, 0.8, 0.2)))
         expected = draw(trained(color=(0.1, 0.8, 0.2)), camera_of(aside, *SIZE), "colour").image
-        until(viewer, client, lambda _: close_to(client.images[-1], expected))
+        until(viewer, client, lambda _: full(client)(_) and close_to(client.images[-1], expected))
         assert not viewer.draw_next(), "nothing has changed since"
 
 
