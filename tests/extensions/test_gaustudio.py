@@ -321,6 +321,9 @@ def test_initialisers(scene, rng, monkeypatch):
     boxed = initialisers.box(g, scene, rng)
     low, high = np.quantile(g.means, [0.02, 0.98], axis=0)
     assert boxed.means.shape == g.means.shape and np.all((boxed.means >= low) & (boxed.means <= high))
+    tight = initialisers.box(g, scene._replace(extent=0.4), rng)
+    assert_allclose(np.exp(tight.log_scales), 0.02, rtol=1e-6)  # a twentieth, as 30 points lie wide apart
+    assert np.exp(boxed.log_scales).max() > 0.02
     many = initialisers.box(make_gaussians(rng, 2_000), scene, rng).means
     wide = np.quantile(make_gaussians(rng, 2_000).means, [0.02, 0.98], axis=0)
     assert_allclose(np.ptp(many, axis=0), wide[1] - wide[0], rtol=0.15)  # of other 2,000: 96 % of the points

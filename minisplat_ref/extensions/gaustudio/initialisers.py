@@ -12,6 +12,7 @@ from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.types import Gaussians, Scene
 
 BOX_SHARE = 0.02  # of the points that may lie outside of the box on either side of an axis
+LARGEST = 0.05  # of the scene's extent, a standard deviation in the box: what exceeds 0.1, density control removes
 
 
 def points(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussians | None:
@@ -32,9 +33,12 @@ def stereo(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaus
 
 
 def box(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussians | None:
-    """As many, grey, at random in the box of the points."""
+    """As many, grey, at random in the box of the points, and no larger than a twentieth of the scene's extent."""
     if n_rows(gaussians) <= N_AXES:
         return None
     low, high = np.quantile(gaussians.means.astype(np.float64), [BOX_SHARE, 1 - BOX_SHARE], axis=0)
     means = rng.uniform(low, high, gaussians.means.shape)
-    return from_means(means, np.zeros_like(gaussians.sh_dc), int(np.sqrt(gaussians.sh_rest.shape[1] + 1)) - 1)
+    made = from_means(means, np.zeros_like(gaussians.sh_dc), int(np.sqrt(gaussians.sh_rest.shape[1] + 1)) - 1)
+    return made._replace(
+        log_scales=np.minimum(made.log_scales, made.log_scales.dtype.type(np.log(LARGEST * scene.extent)))
+    )
