@@ -32,6 +32,7 @@ from minisplat_ref.extensions.lucas_kanade.reference import (
     turned_vjp,
 )
 from minisplat_ref.extensions.lucas_kanade.stages import stages
+from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.oracle.gradients import inner_product_case
@@ -323,6 +324,24 @@ def test_backends_agree(rng):
         ours, theirs = v.shared[name], v_expected.shared[name]
         assert ours.dtype == np.float32 and ours.shape == model.shared[name].shape
         assert np.abs(ours - theirs).max() <= PARITY_FLOAT32_GRADIENT * np.abs(theirs).max() and theirs.any(), name
+
+
+def test_degree_one_with_a_centre_at_every_gaussian_is_linear_motion(rng):
+    """A width of nearly nothing makes the basis the identity: image and gradients are those of ``velocity``."""
+    g, view, request = make_gaussians(rng, 30), view_from(make_camera(), time=0.7), Request(backend=REFERENCE)
+    velocities = 0.3 * rng.normal(size=(30, 3))
+    nothing = {TURNS: np.zeros((30, 1, 3)), GROWTHS: np.zeros((30, 1, 1)), LOG_WIDTH: np.array([-20.0])}
+    model = Model(g, {CENTERS: g.means, SHIFTS: velocities[:, None], **nothing})
+    linear = Model(MovingGaussians(**g._asdict(), velocities=velocities))
+    (output, tape), (expected, tape_of_linear) = (
+        renderer.render(each, view, request) for renderer, each in ((RENDERER, model), (MOVING.renderer, linear))
+    )
+    assert_array_equal(output.image, expected.image)
+    v_image = rng.normal(size=output.image.shape)
+    found = RENDERER.render_vjp(tape, v_image, None)
+    theirs = MOVING.renderer.render_vjp(tape_of_linear, v_image, None).gaussians
+    assert_allclose(found.shared[SHIFTS][:, 0], theirs.velocities, rtol=1e-9, atol=1e-12)
+    assert np.abs(theirs.velocities).max() > 0.01
 
 
 # --- no motion ---
