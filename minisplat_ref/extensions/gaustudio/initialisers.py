@@ -33,7 +33,10 @@ def stereo(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaus
 
 
 def box(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussians | None:
-    """As many, grey, at random in the box of the points, and no larger than a twentieth of the scene's extent."""
+    """As many, grey, at random in the box of the points.
+
+    They are no larger than a twentieth of the scene's extent.
+    """
     if n_rows(gaussians) <= N_AXES:
         return None
     low, high = np.quantile(gaussians.means.astype(np.float64), [BOX_SHARE, 1 - BOX_SHARE], axis=0)
