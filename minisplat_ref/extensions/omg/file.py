@@ -23,18 +23,9 @@ import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.omg import trained_file
+from minisplat_ref.extensions.omg import parts, trained_file
 from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
 from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_differences, to_halves
-from minisplat_ref.extensions.omg.parts import (
-    GAUSSIANS_MAX,
-    are_codes,
-    are_planes,
-    is_center,
-    no_gaussians,
-    read_codes,
-    read_integers,
-)
 from minisplat_ref.extensions.omg.svq import QUAT_MIN, Quantised, quantise, unit_quats
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label
@@ -174,8 +165,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     packed = parse(CONTAINER, content, source)
     header = _check_header(packed)
     n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
-    offsets = from_differences(read_integers(packed, header, "means", 3))
-    vectors = {name: read_codes(packed, header, name, width).vectors() for name, width in WIDTHS.items()}
+    offsets = from_differences(parts.read_integers(packed, header, "means", 3))
+    vectors = {name: parts.read_codes(packed, header, name, width).vectors() for name, width in WIDTHS.items()}
     raw = unpack(packed, "decoder", 2 * (1 + header.n_features) * 3 * n_rest)
     table = np.frombuffer(raw, "<f2").reshape(1 + header.n_features, 3 * n_rest)
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
@@ -211,19 +202,19 @@ def _check_header(packed: Packed) -> _Header:
     values = {name: packed.header.get(name) for name in _Header._fields}
     n, degree, level, center, n_features, codes, planes = values.values()
     is_right = (
-        is_count(n, GAUSSIANS_MAX)
+        is_count(n, parts.GAUSSIANS_MAX)
         and is_count(degree, SH_DEGREE_MAX)
         and is_count(level)
-        and is_center(center)
+        and parts.is_center(center)
         and is_count(n_features, 3 * ((SH_DEGREE_MAX + 1) ** 2 - 1))
-        and are_planes(planes, WIDTHS)
+        and parts.are_planes(planes, WIDTHS)
     )
     if is_right:
         assert isinstance(n_features, int)
         n_parts = {"scales": 3, "rotations": 2, "opacities": 1, "appearance": -(-(3 + n_features) // 2)}
-        is_right = are_codes(codes, {name: (n_parts[name], CODES_MAX) for name in WIDTHS})
+        is_right = parts.are_codes(codes, {name: (n_parts[name], CODES_MAX) for name in WIDTHS})
     if not is_right:
-        raise no_gaussians(packed)
+        raise parts.no_gaussians(packed)
     return _Header(**values)  # type: ignore[arg-type]
 
 

@@ -21,17 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.omg import parts
 from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_differences, to_halves
 from minisplat_ref.extensions.omg.decoding import split_codes
-from minisplat_ref.extensions.omg.parts import (
-    GAUSSIANS_MAX,
-    are_codes,
-    are_planes,
-    is_center,
-    no_gaussians,
-    read_codes,
-    read_integers,
-)
 from minisplat_ref.extensions.omg.population import CODEBOOKS, PLACE, SIZES, OmgGaussians
 from minisplat_ref.extensions.omg.renderer import decode as decode_model
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
@@ -120,11 +112,11 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     shared = _networks(packed)
     columns = []
     for name, shape in CODEBOOKS.items():
-        found = read_codes(packed, header, name, shape[2])
+        found = parts.read_codes(packed, header, name, shape[2])
         rows = [part.astype(np.float32) for part in found.codes]
         shared[name] = np.stack([np.pad(part, ((0, shape[1] - len(part)), (0, 0))) for part in rows])
         columns.append(found.indices.astype(np.float32))
-    offsets = from_differences(read_integers(packed, header, "means", 3)).astype(np.float32)
+    offsets = from_differences(parts.read_integers(packed, header, "means", 3)).astype(np.float32)
     shared[PLACE] = np.array([0, 0, 0, header.inverse_radius])
     # of damaged files; what is not finite is refused
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -152,8 +144,8 @@ def _networks(packed: Packed) -> dict[str, Floats]:
     shapes = _network_shapes()
     sizes = [math.prod(shape) for shape in shapes.values()]
     bits = from_planes(unpack(packed, "networks", 2 * sum(sizes)), 2, 1, sum(sizes))[:, 0].astype(np.uint16)
-    parts = np.split(bits.view(np.float16).astype(np.float32), np.cumsum(sizes)[:-1])
-    return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+    arrays = np.split(bits.view(np.float16).astype(np.float32), np.cumsum(sizes)[:-1])
+    return {name: array.reshape(shape) for (name, shape), array in zip(shapes.items(), arrays, strict=True)}
 
 
 class _Header(NamedTuple):
@@ -176,15 +168,15 @@ def _check_header(packed: Packed) -> _Header:
     values = {name: packed.header.get(name) for name in _Header._fields}
     n, center, unit, inverse_radius, codes, planes = values.values()
     is_right = (
-        is_count(n, GAUSSIANS_MAX)
-        and is_center(center)
+        is_count(n, parts.GAUSSIANS_MAX)
+        and parts.is_center(center)
         and _is_length(unit)
         and _is_length(inverse_radius)
-        and are_codes(codes, {name: shape[:2] for name, shape in CODEBOOKS.items()})
-        and are_planes(planes, CODEBOOKS)
+        and parts.are_codes(codes, {name: shape[:2] for name, shape in CODEBOOKS.items()})
+        and parts.are_planes(planes, CODEBOOKS)
     )
     if not is_right:
-        raise no_gaussians(packed)
+        raise parts.no_gaussians(packed)
     return _Header(**values)  # type: ignore[arg-type]
 
 
