@@ -6,12 +6,10 @@ order of Gaussians, passes there. It does not pass here, unless all backends are
 
 from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
-
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.cases import Case, Figure
-from minisplat_ref.oracle.differences import largest_error
+from minisplat_ref.oracle.differences import largest_error, relative_error
 from minisplat_ref.oracle.models import Stages, model_settings, model_stages
 from minisplat_ref.oracle.tolerances import COMPARE_FLOAT64
 from minisplat_ref.training.representation import Representation
@@ -41,8 +39,10 @@ def agreement_cases(
     -------
     list of list of Case
         The cases of each backend, none for the first: a case for each stage on the larger scene, whose error is
-        relative to the largest value of an output.
+        relative to the largest value of an output. Nothing is computed if there is one backend.
     """
+    if len(backends) == 1:
+        return [[]]
     of_backends = [dict(_outputs(backend, conventions, representation, stages)) for backend in backends]
     first, name = of_backends[0], backends[0].name
     rest = ([_case(stage, name, first[stage], got) for stage, got in own.items()] for own in of_backends[1:])
@@ -59,16 +59,8 @@ def _outputs(
 
 
 def _case(stage: str, first: str, expected: Mapping[str, Floats], got: Mapping[str, Floats]) -> Case:
-    errors = {name: _relative(got[name], expected[name]) for name in expected}
+    errors = {name: relative_error(got[name], expected[name]) for name in expected}
     wrong = [name for name, error in errors.items() if not error <= COMPARE_FLOAT64]
     note = f"{' and '.join(wrong)} not as on {first}" if wrong else ""
     figures: dict[str, Figure] = {"error": largest_error(list(errors.values())), "limit": COMPARE_FLOAT64}
     return Case(f"{stage}: as on {first}", not wrong, figures, note)
-
-
-def _relative(got: Floats, expected: Floats) -> float:
-    """Return the largest difference relative to the largest value; infinite where the shapes differ."""
-    if np.shape(got) != np.shape(expected):
-        return np.inf
-    size = float(np.abs(expected).max(initial=0.0))
-    return float(np.abs(got - expected).max(initial=0.0)) / (size if size > 0 else 1.0)

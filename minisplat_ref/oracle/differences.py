@@ -72,6 +72,17 @@ def largest_error(errors: Sequence[float]) -> float:
     return float(np.max(errors)) if len(errors) else np.nan
 
 
+def relative_error(got: Floats, expected: Floats) -> float:
+    """Return the largest difference of two arrays relative to the largest value expected.
+
+    It is absolute where all that is expected is below ``GRADIENT_FLOOR``, and infinite where the shapes differ.
+    """
+    if np.shape(got) != np.shape(expected):
+        return np.inf
+    size = float(np.abs(expected).max(initial=0.0))
+    return float(np.abs(got - expected).max(initial=0.0)) / (size if size > GRADIENT_FLOOR else 1.0)
+
+
 class JacobianCheck(NamedTuple):
     """Full Jacobians of a function, by differences and by its VJP."""
 

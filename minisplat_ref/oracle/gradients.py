@@ -22,6 +22,7 @@ from minisplat_ref.oracle.differences import (
     check_inner_products,
     check_jacobians,
     largest_error,
+    relative_error,
 )
 from minisplat_ref.oracle.pieces import PIECES, SEED, tiny_setting
 from minisplat_ref.oracle.public_call import CALLS, Call, rasterization_stage
@@ -191,7 +192,7 @@ def autograd_cases(backend: Backend) -> list[Case]:
         rng = np.random.default_rng(SEED)
         cotangents = [rng.normal(size=np.shape(output)) for output in outputs]
         gradients = zip(ours.vjp(*cotangents), theirs.vjp(*cotangents), strict=True)
-        errors = [_relative(got, expected) for got, expected in gradients]
+        errors = [relative_error(got, expected) for got, expected in gradients]
         wrong = zip(ours.inputs, errors, strict=True)
         problems = [f"gradient with respect to {name} differs" for name, error in wrong if not error <= PEER_REL]
         figures = {"error": largest_error(errors), "limit": PEER_REL}
@@ -210,8 +211,3 @@ def _case(name: str, stage: Stage, outputs: Sequence[Floats], figures: dict[str,
 
 def _limit(step: float) -> float:
     return GRADIENT_REL if step >= STEPS[2] else GRADIENT_REL_NEAR_THRESHOLD
-
-
-def _relative(got: Floats, expected: Floats) -> float:
-    size = float(np.abs(expected).max())
-    return float(np.abs(got - expected).max()) / (size if size > GRADIENT_FLOOR else 1.0)
