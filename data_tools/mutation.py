@@ -18,7 +18,6 @@ import os
 import random
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from collections import Counter, defaultdict
@@ -33,11 +32,10 @@ from cosmic_ray.modules import filter_paths, find_modules
 from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB, use_db
 
-from data_tools.sources import Imports, annotations
+from data_tools.sources import Imports, annotations, copy_tree
 from minisplat_ref.arguments import HelpFormatter, Parser, integer
 from minisplat_ref.reporting import markdown_table
 
-ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = "data_tools/mutation.toml"
 TESTS = Path("tests")
 FILES_MAX = 6  # of tests for a change; all are imported before the first runs
@@ -124,23 +122,6 @@ def _score(counts: Counter[bool]) -> tuple[str, str, str]:
     return str(counts[True]), str(counts[False]), f"{counts[True] / counts.total():.0%}"
 
 
-def copy_tree(folder: Path) -> Path:
-    """Return a copy of the working tree as git sees it, beside the real scenes if they are there."""
-    names = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        capture_output=True,
-        check=True,
-    )
-    for name in filter(None, names.stdout.decode().split("\0")):
-        if (ROOT / name).is_file():
-            (folder / "repo" / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, folder / "repo" / name)
-    if (ROOT.parent / "shared").is_dir():
-        (folder / "shared").symlink_to(ROOT.parent / "shared")
-    return folder / "repo"
-
-
 def main() -> None:
     """Draw, or continue a session; print what survived and the scores."""
     parser = Parser(
@@ -157,7 +138,7 @@ def main() -> None:
     )
     parser.add_argument("--again", action="store_true", help="test what survived once more, for a longer time perhaps")
     args = parser.parse_args()
-    session = args.session.resolve()
+    session, home = args.session.resolve(), Path.cwd()
     with TemporaryDirectory() as folder, use_db(session) as db:
         os.chdir(copy_tree(Path(folder)))
         os.environ["PYTHONPATH"] = os.getcwd()
@@ -169,7 +150,7 @@ def main() -> None:
             db.add_work_items(draw_changes(modules, settings, args.sample, random.Random(args.seed)))
         run(db, Imports(every, sorted(TESTS.rglob("test_*.py"))), settings, args.seconds, args.again)
         print("\n".join(report(db)))
-        os.chdir(ROOT)
+        os.chdir(home)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,13 @@
-"""What ``data_tools.mutation`` must know of the sources: which test files import a module, and where types stand."""
+"""What the tools that change the code must know of the sources: which test files import a module, where types stand."""
 
 import ast
+import shutil
+import subprocess
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 class Imports:
@@ -74,3 +78,20 @@ def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     return [
         ((node.lineno, node.col_offset), (node.end_lineno or 0, node.end_col_offset or 0)) for node in found if node
     ]
+
+
+def copy_tree(folder: Path) -> Path:
+    """Return a copy of the working tree as git sees it, beside the real scenes if they are there."""
+    names = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
+    for name in filter(None, names.stdout.decode().split("\0")):
+        if (ROOT / name).is_file():
+            (folder / "repo" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / "repo" / name)
+    if (ROOT.parent / "shared").is_dir():
+        (folder / "shared").symlink_to(ROOT.parent / "shared")
+    return folder / "repo"
