@@ -7,6 +7,8 @@ PlayCanvas, its SOG. Sizes are those of whole files.
 SPZ has a fixed step of 2^-12 world units for centres and a fixed range for scales; the step of ``.msz`` follows the
 small Gaussians. So the study also makes the scene smaller and smaller, with Gaussians, cameras and near plane together:
 every image stays the same, and so should the loss of a file.
+
+SPZ's harmonics have 4 and 5 bits. What they cost is the difference from a file that keeps them as they were.
 """
 
 import argparse
@@ -59,17 +61,20 @@ def run(args: argparse.Namespace) -> kit.Report:
         The program cannot be used.
     """
     scene = kit.read_scene(args.scene, args.downscale)
-    runs, shrunk, psnrs, counts = [], [], [], []
+    runs, shrunk, psnrs, counts, kept = [], [], [], [], []
     for gaussians in kit.populations(args, scene):
         psnrs.append(mean_psnr(gaussians, scene.test_views, scene.background))
         counts.append(len(gaussians.means))
         files = rate_points(gaussians, scene.test_views, scene.background, psnrs[-1], args.splat_transform)
         runs.append([point._asdict() for point in kit.with_progress(files, "files")])
+        kept.append(drop_beside_harmonics(gaussians, scene.test_views, scene.background, psnrs[-1]))
         shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
     drops = {name: [of_seed[name] for of_seed in shrunk] for name in shrunk[0]}
     result = {**kit.describe_trainings(args, scene), "psnr": psnrs, "gaussians": counts, "runs": runs, "shrunk": drops}
+    result |= {"spz_beside_harmonics": kept}
     text = f"{scene.name}: {with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n\n"
     text += markdown_table(["file", "bytes", "bytes per Gaussian", "dB lost"], to_rows(runs))
+    text += f"\n\n.spz with the harmonics kept as they are loses {with_deviation(kept, 3)} dB"
     text += "\n\ndB lost by size of the scene\n\n"
     rows = [[name, *(with_deviation(d, 3) for d in zip(*of_seeds, strict=True))] for name, of_seeds in drops.items()]
     text += markdown_table(["file", *(f"1/{1 / factor:.0f}" for factor in SHRUNK)], rows)
@@ -109,6 +114,12 @@ def round_trip(gaussians: Gaussians, format_: Format, level: int) -> tuple[bytes
     """Return the content of a file, and the Gaussians that are read from it."""
     content = format_.encode(gaussians, level)
     return content, format_.decode(content, format_.suffix)
+
+
+def drop_beside_harmonics(gaussians: Gaussians, views: tuple[View, ...], background: Floats, psnr: float) -> float:
+    """Return the loss of an ``.spz``, dB, if the harmonics of degree 1 and above were kept as they are."""
+    back = round_trip(gaussians, SPZ, 0)[1]
+    return psnr - mean_psnr(back._replace(sh_rest=gaussians.sh_rest), views, background)
 
 
 def sog_round_trip(program: str, ply: Path) -> tuple[int, Gaussians]:
