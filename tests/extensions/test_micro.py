@@ -214,10 +214,13 @@ def test_the_recipe_merges_within_a_size_and_a_tenth_of_a_colour(distance, color
 
 
 def test_the_recipe_removes_a_hundredth_of_opacity_times_size():
-    """Of four balls of one opacity the two of size 0.5 and 0.4 have 0.9 % of the sum of the sizes, 100."""
-    state = state_of(balls(np.zeros((4, 3)), [0.5, 60.0, 39.1, 0.4]))
+    """Of four balls of one opacity the two of size 0.5 and 0.4 have 0.9 % of the sum of the sizes, 100.
+
+    Of the sum of their squares the second has 99.4 % alone.
+    """
+    state = state_of(balls(np.zeros((4, 3)), [0.5, 92.0, 7.1, 0.4]))
     act(find_recipe("micro"), prune_least, state, scene_of())
-    assert_allclose(np.exp(state.gaussians.log_scales[:, 0]), [60.0, 39.1])
+    assert_allclose(np.exp(state.gaussians.log_scales[:, 0]), [92.0, 7.1])
     faint = balls(np.zeros((3, 3)), [1.0, 1.0, 1.0])._replace(opacity_logits=np.array([4.0, -6.0, 4.0]))
     state = state_of(faint)  # opacities of 0.982, 0.0025 and 0.982
     act(find_recipe("micro"), prune_least, state, scene_of())

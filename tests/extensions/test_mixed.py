@@ -294,10 +294,51 @@ def test_a_fourth_point_is_no_part_of_a_triangle():
     assert groups(points, np.full((4, 3), 50.0)).tolist() == [[0, 1, 2], [3, -1, -1]]
 
 
+@pytest.mark.parametrize(("gap", "is_one"), [(1.9, True), (2.1, False)])
+def test_a_pair_is_at_most_twice_as_far_apart_as_the_nearest_of_either(gap, is_one):
+    """The second point has one at 1 on its other side, which is of another colour."""
+    points = np.array([[0.0, 0, 0], [gap, 0, 0], [gap + 1, 0, 0]])
+    found = groups(points, np.array([[50.0, 0, 0], [50, 0, 0], [90, 0, 0]])).tolist()
+    assert found == ([[0, 1, -1], [2, -1, -1]] if is_one else [[0, -1, -1], [1, -1, -1], [2, -1, -1]])
+
+
+@pytest.mark.parametrize(("n_nearer", "is_one"), [(2, True), (3, False)])
+def test_a_pair_is_among_three_neighbours_of_one(n_nearer, is_one):
+    """Of two points 1.5 apart each has nearer ones around it, none of them like another."""
+    around = np.array([[-1.0, 0, 0], [0, 1, 0], [0, -1, 0]])[:n_nearer]
+    points = np.concatenate([[[0, 0, 0], [1.5, 0, 0]], around, [1.5, 0, 0] - around * [1, 1.01, 1.01]])
+    lab = np.column_stack([np.arange(len(points)) * 10.0, np.zeros((len(points), 2))])
+    lab[1] = lab[0]
+    assert ([0, 1, -1] in groups(points, lab).tolist()) is is_one
+
+
+def test_the_nearest_pairs_join_first():
+    """Each of the first three distances would do; a group has three points, so the first point comes too late."""
+    points = np.array([[0.0, 0, 0], [1.9, 0, 0], [2.9, 0, 0], [3.95, 0, 0]])
+    assert groups(points, np.full((4, 3), 50.0)).tolist() == [[0, -1, -1], [1, 2, 3]]
+
+
+def test_a_group_is_half_as_thick_as_its_points_are_on_average(rng):
+    """Deviations of 1, 2, 4 and of 2, 4, 8 have the geometric mean sqrt(8)."""
+    g = as_dtype(make_gaussians(rng, 2), np.float64)
+    g = g._replace(
+        means=np.array([[0.0, 0, 3], [1, 0, 3]]),
+        sh_dc=np.zeros((2, 3)),
+        log_scales=np.log([[1.0, 2, 4], [2, 4, 8]]),
+    )
+    assert_allclose(group_gaussians(g, rng).log_scales, np.full((1, 3), np.log(np.sqrt(8) / 2)), atol=CLOSED_FORM)
+
+
+def test_numbers_of_vertices_are_one_to_three(rng):
+    population = as_ellipses(make_gaussians(rng, 4))._replace(n_vertices=np.array([0.2, 1.6, 2.4, 3.7]))
+    assert counts(population).tolist() == [1, 2, 2, 3]
+
+
 def test_lab_of_known_colours():
-    found = to_lab(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1]]))
-    expected = [[100, 0, 0], [0, 0, 0], [53.24, 80.09, 67.2], [32.3, 79.19, -107.86]]
+    found = to_lab(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, 0.2, 0.2]]))
+    expected = [[100, 0, 0], [0, 0, 0], [53.24, 80.09, 67.2], [32.3, 79.19, -107.86], [21.25, 0, 0]]
     assert_allclose(found, expected, atol=0.05)  # tables have two digits
+    assert_allclose(to_lab(np.full((1, 3), 0.02))[0, 0], 903.296 * 0.02 / 12.92, atol=1e-3)  # the straight part
 
 
 def test_a_group_has_its_points_for_vertices(rng):
