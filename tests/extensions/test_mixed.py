@@ -13,7 +13,7 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.extension_times import extension_cases
 from minisplat_ref.bench.workloads import synth5k
 from minisplat_ref.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.cpu.compositing.hits import composite_hits as composite_by_kernels
 from minisplat_ref.cpu.compositing.plain_conic import composite as composite_conics
 from minisplat_ref.datasets.synthetic import make_scene
@@ -329,6 +329,14 @@ def test_a_group_is_half_as_thick_as_its_points_are_on_average(rng):
     assert_allclose(group_gaussians(g, rng).log_scales, np.full((1, 3), np.log(np.sqrt(8) / 2)), atol=CLOSED_FORM)
 
 
+@pytest.mark.parametrize(("grey", "n"), [(0.4, 1), (0.1, 2)])
+def test_colours_are_those_that_are_seen(grey, n, rng):
+    """Of 0.4, and of 0.1 beside 0.4, coefficients of degree 0 are below zero."""
+    g = make_gaussians(rng, 2)._replace(means=np.array([[0.0, 0, 3], [1, 0, 3]]))
+    g = g._replace(sh_dc=np.repeat([[0.4 - 0.5], [grey - 0.5]], 3, axis=1) / SH_C0)
+    assert len(group_gaussians(g, rng).means) == n
+
+
 def test_numbers_of_vertices_are_one_to_three(rng):
     population = as_ellipses(make_gaussians(rng, 4))._replace(n_vertices=np.array([0.2, 1.6, 2.4, 3.7]))
     assert counts(population).tolist() == [1, 2, 2, 3]
@@ -379,6 +387,8 @@ def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
     largest_two = np.sort(log_scales, axis=1)[:2, 1:].sum(axis=1)
     covers = coverage(whiten_vertices(after), counts(after))[:2] * np.exp(after.log_scales[:2, :2].sum(axis=1))
     assert_allclose(covers, 2 * np.pi * np.exp(largest_two), rtol=CLOSED_FORM * 10)
+    assert_allclose(after.log_scales[0, :2], np.log(0.05))  # all round, that of the needle's second axis
+    assert_allclose(after.log_scales[1, :2], np.log(np.sqrt(0.3 * 0.35) / 2))
     R, R_before = rotation_matrices(after.quats), rotation_matrices(population.quats)
     assert_allclose(np.abs(np.sum(R[0, :, 0] * R_before[0, :, 1])), 1)  # along the needle
     assert_allclose(np.abs(np.sum(R[1, :, 2] * R_before[1, :, 1])), 1)  # in the disc's plane

@@ -60,8 +60,8 @@ def simplify_kinds(population: MixedGaussians, *, least: float, min_height: floa
     """
     n, y = counts(population), whiten_vertices(population)
     places = in_plane(population.vertices, n)
-    lengths = np.linalg.norm(np.roll(y, -1, axis=1) - y, axis=2)  # [N, 3] of the edges from k to k + 1
-    lengths[n == 2, 1:] = 0  # of a line only the first counts
+    # Edges from k to k + 1, [N, 3]; the third vertex of a line is its mean, so its first edge is the longest.
+    lengths = np.linalg.norm(np.roll(y, -1, axis=1) - y, axis=2)
     longest = lengths.max(axis=1)
     is_point = (n > 1) & (longest < least)
     double = 3 * np.abs(y[:, 1, 0] * y[:, 2, 1] - y[:, 1, 1] * y[:, 2, 0])  # the area: y is from the mean
