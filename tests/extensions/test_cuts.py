@@ -227,6 +227,7 @@ def test_the_number_of_curves(rng):
     middles = three.mean(axis=2)
     assert_allclose(np.linalg.norm(middles, axis=2), 1, rtol=CLOSED_FORM)
     assert_allclose(middles.sum(axis=1), 0, atol=CLOSED_FORM)  # evenly around the centre
+    assert (with_cuts(gaussians, rng).widths == 1).all()  # px
     for wrong in (0, 5):
         with pytest.raises(InputError, match=f"n_curves is {wrong}: give 1 to 4"):
             with_cuts(gaussians, rng, n_curves=wrong)

@@ -38,7 +38,7 @@ from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import Request
 from minisplat_ref.studies.kit import psnr_of
-from minisplat_ref.types import Model, Primitives, Projection, TileGrid, view_from
+from minisplat_ref.types import Gaussians, Model, Primitives, Projection, TileGrid, view_from
 from payloads import drawn
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, HULL_COVERAGE, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, TANGENT_LEVEL
@@ -395,6 +395,13 @@ def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
     assert_allclose(after.means, population.means)
 
 
+@pytest.mark.parametrize("scales", [[0.5, 0.2, 0.01], [0.25, 0.15, 0.01], [0.3, 0.29, 0.06]])
+def test_what_is_no_disc_stays(scales, rng):
+    """Longer than twice its width, not as wide as the limit, or not six times as thin."""
+    population = as_ellipses(make_gaussians(rng, 1))._replace(log_scales=np.log([scales]))
+    assert not promote_kinds(population, ratio=6.0, size_limit=0.2)[1].any()
+
+
 def test_the_recipe_promotes_what_is_six_times_as_long_as_wide_and_a_hundredth_of_the_extent():
     """In a scene of extent 2 from 0.02 on. What changes its shape loses the moments of its shape, and no others."""
     widths = [[0.06, 0.0101, 0.0101], [0.0606, 0.01, 0.01], [0.019, 0.003, 0.003], [0.021, 0.003, 0.003]]
@@ -487,6 +494,18 @@ def test_the_letter_is_a_silhouette():
     image = fit.letter_a()[..., 0]
     assert image[30, 24] == pytest.approx(0.8) and image[20, 24] == 0 and image[2, 2] == 0
     assert 0.05 < np.mean((image > 0) & (image < 0.79)) < 0.2
+
+
+def test_the_ring_is_five_pixels_wide():
+    assert_allclose(fit.ring()[..., 0].sum(), 0.8 * np.pi * (17.5**2 - 12.5**2), rtol=1e-3)
+
+
+@pytest.mark.parametrize("n_vertices", [1, 2, 3])
+def test_numbers_are_counted_as_they_are_used(n_vertices, rng):
+    """Of the fields of a primitive, and of the vertices that it has besides the first."""
+    of_one = fit.scatter(1, n_vertices, rng)
+    six = sum(np.size(getattr(of_one, name)) for name in Gaussians._fields)
+    assert fit.N_FLOATS[n_vertices] == six + 2 * (n_vertices - 1)
 
 
 @pytest.mark.parametrize(("name", "n_images"), [("shapes", 3), ("letter", 2)])

@@ -246,6 +246,13 @@ def test_a_fifth_begins_with_the_negative_of_its_color(rng):
     assert_array_equal(extended.means, gaussians.means)
 
 
+@pytest.mark.parametrize(("n", "n_negative"), [(12, 2), (13, 3)])
+def test_the_number_of_negatives_is_rounded(n, n_negative, rng):
+    """A fifth is 2.4 and 2.6."""
+    extended = with_negatives(of_colors(np.full((n, 3), 0.5)), rng, fraction=0.2)
+    assert np.count_nonzero(extended.sh_dc[:, 0] < 0) == n_negative
+
+
 def test_the_negative_of_a_colour_is_negative_in_every_direction(rng):
     """Of ten Gaussians two are negated, with degrees 0 and 1: seen along (0.6, 0, 0.8) and from the other side."""
     C, gaussians = 0.4886025119029199, of_either_sign(rng, 10, sh_degree=1)
