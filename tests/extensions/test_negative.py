@@ -16,7 +16,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.negative import STUDIES, rings
+from minisplat_ref.extensions.negative import STUDIES, backdrop, rings
 from minisplat_ref.extensions.negative.method import (
     FRACTION,
     SIGNED,
@@ -25,6 +25,7 @@ from minisplat_ref.extensions.negative.method import (
     with_negatives,
 )
 from minisplat_ref.extensions.negative.reference import density, difference, largest_weight, negate
+from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
 from minisplat_ref.runs.progress import Progress
@@ -342,6 +343,41 @@ def test_jacobian_of_the_hills(rng):
         return (np.einsum("kpn,kn->kp", jacobian, v),)
 
     check_jacobian(lambda p: (rings.hills(p, model, points)[0],), vjp, (parameters,), names=["parameters"])
+
+
+def test_the_best_fit_of_a_ring_counts():
+    """The PSNR is that of its image, and none of the others is better."""
+    model, target = rings.MODELS["2 positive"], rings.ring(0.6)
+    ones = np.random.default_rng(3)
+    alone = [rings.fit_ring(target, model, 1, ones) for _ in range(3)]
+    best = rings.fit_ring(target, model, 3, np.random.default_rng(3))
+    assert best.psnr == max(fit.psnr for fit in alone) > alone[0].psnr
+    assert_allclose(best.psnr, psnr(best.image, target.reshape(best.image.shape)), rtol=CLOSED_FORM)
+
+
+def test_the_best_fit_before_a_wall_counts(monkeypatch):
+    monkeypatch.setattr(backdrop, "EVALUATIONS", 25)
+    behind, case = backdrop.wall("black"), backdrop.CASES["2, either sign"]
+    ones = np.random.default_rng(0)
+    target = backdrop.truth(behind)
+    alone = [backdrop.fit_behind(behind, target, case, 1, ones).psnr for _ in range(3)]
+    best = backdrop.fit_behind(behind, target, case, 3, np.random.default_rng(0)).psnr
+    assert best == max(alone) > min(alone)
+
+
+def test_a_fit_before_a_wall_moves_parallel_to_the_image(monkeypatch):
+    """So that the order stays: a dark Gaussian at 2.9 before a bright one at 3."""
+    monkeypatch.setattr(backdrop, "EVALUATIONS", 5)
+    rendered, depths = backdrop._render, []
+
+    def spy(renderer, ring, behind):
+        depths.append(ring.means[:, 2].tolist())
+        return rendered(renderer, ring, behind)
+
+    monkeypatch.setattr(backdrop, "_render", spy)
+    behind = backdrop.wall("black")
+    backdrop.fit_behind(behind, backdrop.truth(behind), backdrop.CASES["2, clamped"], 1, np.random.default_rng(0))
+    assert len(depths) >= 5 and all(of_ring == [3.0, 2.9] for of_ring in depths)
 
 
 def run_study(name, folder, *arguments):

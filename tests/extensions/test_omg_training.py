@@ -11,13 +11,21 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.decoding import encode_places, gather, gather_vjp, run_networks
-from minisplat_ref.extensions.omg.method import fit_last_layer, round_centres, start_codes, start_networks, write_fields
+from minisplat_ref.extensions.omg.method import (
+    fit_last_layer,
+    prune_indistinct,
+    round_centres,
+    start_codes,
+    start_networks,
+    write_fields,
+)
 from minisplat_ref.extensions.omg.population import PLACE, OmgGaussians, place_of, with_features, without_features
 from minisplat_ref.extensions.omg.renderer import COMPACT, decode, decode_vjp
 from minisplat_ref.extensions.omg.svq import QUAT_MIN
 from minisplat_ref.mechanisms.networks.networks import COMPILED, IN_NUMPY
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, restart_from_means
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
+from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
@@ -230,6 +238,31 @@ def test_codebooks_are_limited(scene):
     start_codes(state, iteration, scale_codes=4, rotation_codes=512, feature_codes=1024, rows_per_code=8)
     n_codes = [len(np.unique(column)) for column in state.gaussians.codes.T]
     assert n_codes[:3] == [4, 4, 4] and max(n_codes[3:]) == 15 and len(n_codes) == 5  # without features
+
+
+def test_codebooks_have_a_code_at_least(scene):
+    state, iteration = state_and_iteration(scene)
+    start_networks(state, iteration)
+    start_codes(state, iteration, **LIMITS, rows_per_code=121)  # of 120 Gaussians
+    assert not state.gaussians.codes.any()
+
+
+def test_the_steps_of_codes_are_counted_from_their_start(scene):
+    state, iteration = state_and_iteration(scene)
+    start_networks(state, iteration)
+    state.shared_adam = state.shared_adam._replace(step=55)
+    start_codes(state, iteration, **LIMITS, rows_per_code=8)
+    joined = {name: step for name, step in state.shared_adam.joined.items() if step == 55}
+    assert joined == {"scale_codes": 55, "rotation_codes": 55, "feature_codes": 55}
+
+
+def test_of_features_the_static_ones_are_compared(scene, rng):
+    state, iteration = state_and_iteration(scene)
+    start_networks(state, iteration)
+    state.gaussians.features[:, :3] = 0.25
+    state.gaussians.features[:, 3:] = rng.normal(size=(120, 3))  # of the view
+    note = prune_indistinct(state, iteration, metric=indoor, distinct_mass=0.9, distinct_power=2.0)
+    assert "all colours are alike" in note and len(state.gaussians.means) == 120
 
 
 def test_in_the_end_the_fields_are_what_is_drawn(scene):
