@@ -13,6 +13,7 @@ from minisplat_ref.extensions.style.reference import (
 from minisplat_ref.mechanisms.features import network
 from minisplat_ref.mechanisms.features.bank import FeatureBank
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
+from minisplat_ref.mechanisms.features.layers import max_pool_vjp
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
@@ -61,7 +62,10 @@ def tiny_network(rng: np.random.Generator) -> FeatureBank:
 
 
 def feature_stage(bank: FeatureBank, image: Floats, moved: Part, name: str) -> Stage:
-    """Return a bank's features as a stage, as a function of a part of the image; what a ReLU passes is a threshold."""
+    """Return a bank's features as a stage, as a function of a part of the image.
+
+    What a ReLU passes is a threshold, and so is which of four pixels has the maximum.
+    """
 
     def function(part: Floats) -> Point:
         copy = image.copy()
@@ -69,7 +73,9 @@ def feature_stage(bank: FeatureBank, image: Floats, moved: Part, name: str) -> S
         maps, tape = bank.features(copy)
         if not isinstance(tape, network._Tape):
             return Point(tuple(maps))
-        return Point(tuple(maps), tuple(y > 0 for y in tape.outputs))
+        halved = ((y, x) for y, x in zip(tape.outputs, tape.inputs[1:], strict=False) if y.shape != x.shape)
+        largest = (max_pool_vjp(y, 2, 2, np.ones_like(x)) for y, x in halved)
+        return Point(tuple(maps), (*(y > 0 for y in tape.outputs), *largest))
 
     def vjp(*v_maps: Floats) -> tuple[Floats, ...]:
         return (bank.features_vjp(bank.features(image)[1], v_maps)[moved],)

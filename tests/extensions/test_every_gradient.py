@@ -1,0 +1,72 @@
+"""What every extension has of its own has the gradient that it says, along random directions, on the reference.
+
+Nothing is named here, so a new extension is checked, too. It is the quick part of ``oracle gradients --extension
+NAME``: no Jacobians, no kernels, which the tests of each extension hold against the reference, and the wider limit.
+"""
+
+import numpy as np
+import pytest
+
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.extensions.extension import load_extensions
+from minisplat_ref.methods import RECIPES
+from minisplat_ref.oracle.differences import careful_derivative, check_inner_products, settled_derivative
+from minisplat_ref.oracle.gradients import MANY_STEPS
+from minisplat_ref.oracle.loss_terms import LARGER, loss_stage, own_terms, stage_name
+from minisplat_ref.oracle.models import model_stages
+from minisplat_ref.oracle.pieces import SEED
+from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL_NEAR_THRESHOLD
+from minisplat_ref.training.representation import GAUSSIANS
+
+EXTENSIONS = {extension.name: extension for extension in load_extensions()}
+WITHOUT = {"compression", "proxies", "segment"}  # formats, edits and labels: nothing that has a gradient
+
+
+def stages_of(extension, rng):
+    """The renderer and further stages on 20 Gaussians, and the loss terms on the first scene in which each acts."""
+    representation = None if extension.representation == GAUSSIANS else extension.representation
+    setting = make_setting(rng, 20, 20, 15, GSPLAT_MAIN, sh_degree=3)
+    stages = model_stages(REFERENCE, setting, representation, extension.stages, rng)
+    core = [term for recipe in RECIPES.values() for term in recipe.losses]
+    terms = own_terms([*extension.losses, *(t for recipe in extension.recipes for t in recipe.losses)], core)
+    losses = [first_acting(term, extension, rng) for term in terms if stage_name(term) not in {s.name for s in stages}]
+    return [*((stage, careful_derivative) for stage in stages), *((stage, settled_derivative) for stage in losses)]
+
+
+def first_acting(term, extension, rng):
+    for size in LARGER:
+        setting = make_setting(rng, *size, GSPLAT_MAIN, sh_degree=3)
+        stage = loss_stage(term, REFERENCE, setting, extension.representation, rng)
+        if stage is not None:
+            return stage
+    raise AssertionError(f"{term.name} is zero")
+
+
+@pytest.mark.parametrize("name", sorted(EXTENSIONS.keys() - WITHOUT))
+def test_gradients_along_random_directions(name):
+    rng = np.random.default_rng(SEED)
+    stages = stages_of(EXTENSIONS[name], rng)
+    assert stages
+    for stage, differentiate in stages:
+        products = check_inner_products(
+            stage.function,
+            stage.vjp,
+            list(stage.inputs.values()),
+            rng,
+            names=list(stage.inputs),
+            steps=MANY_STEPS,
+            differentiate=differentiate,
+        )
+        assert {p.input for p in products} == set(stage.inputs), stage.name
+        for p in products:
+            assert p.step > 0 and p.size > GRADIENT_FLOOR, (stage.name, p)
+            assert p.error <= GRADIENT_REL_NEAR_THRESHOLD, (stage.name, p)
+
+
+@pytest.mark.parametrize("name", sorted(WITHOUT))
+def test_what_has_no_gradient(name):
+    extension = EXTENSIONS[name]
+    assert extension.representation == GAUSSIANS and extension.stages is None
+    assert not extension.losses and not extension.recipes
