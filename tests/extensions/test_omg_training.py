@@ -10,7 +10,7 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.omg import trained_file
-from minisplat_ref.extensions.omg.decoding import encode_places, gather, gather_vjp, run_networks
+from minisplat_ref.extensions.omg.decoding import encode_places, gather, gather_vjp, run_networks, split_codes
 from minisplat_ref.extensions.omg.method import (
     fit_last_layer,
     prune_indistinct,
@@ -90,6 +90,12 @@ def test_codes_by_hand():
     assert_array_equal(gather(books, indices), [[3, 4, 5, 6], [3, 4, 7, 8], [1, 2, 5, 6]])
     v = np.arange(12.0).reshape(3, 4)
     assert_array_equal(gather_vjp(books, indices, v), [[[8, 9], [4, 6]], [[12, 14], [6, 7]]])
+
+
+def test_columns_of_codes_are_read_as_the_nearest_whole_numbers():
+    shared = {"a": np.zeros((2, 3, 1)), "b": np.zeros((1, 3, 1))}
+    found = split_codes(row(0.9999, 2.0001, 1), shared, ("a", "b"))
+    assert {name: rows.tolist() for name, rows in found.items()} == {"a": [[1, 2]], "b": [[1]]}
 
 
 # What must equal 3DGS

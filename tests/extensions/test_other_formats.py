@@ -289,6 +289,20 @@ def test_ksplat_is_read(level, sh_degree):
     assert ("level", str(level)) in KSPLAT.describe(content, "file")
 
 
+def test_ksplat_without_bounds_has_harmonics_to_one_and_a_half():
+    """The file's own bounds are -1.25 and 1.75: a byte is then a quarter more than with -1.5 and 1.5."""
+    content = write_ksplat(mild(83, 1), 2)
+    without = content[:36] + bytes(8) + content[44:]
+    with_bounds, found = (KSPLAT.decode(data, "file") for data in (content, without))
+    assert_allclose(found.sh_rest, with_bounds.sh_rest - 0.25, atol=ROUNDED_TO_FLOAT32)
+
+
+def test_ksplat_reads_no_size_as_a_tiny_one():
+    gaussians = mild(83, 0)
+    gaussians.log_scales[5, 1] = -np.inf
+    assert KSPLAT.decode(write_ksplat(gaussians, 0), "file").log_scales[5, 1] == -10
+
+
 def test_ksplat_refuses():
     content = write_ksplat(mild(83, 1), 1)
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.cli import main
+from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons import claims
 from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, save_soup, soup_of
@@ -17,6 +18,7 @@ from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.mechanisms.meshes.fans import flatten
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
+from minisplat_ref.types import Gaussians
 from scenes import as_dtype, make_gaussians
 from tolerances import AFFINE_EDIT, EDITED_IMAGE, PARITY_FLOAT64
 
@@ -51,6 +53,13 @@ def files(tmp_path, rng):
     save_ply(tmp_path / "model.ply", model(rng))
     assert main(["polygons", "export", str(tmp_path / "model.ply"), "--out", str(tmp_path / "soup.ply")]) == 0
     return tmp_path / "model.ply", tmp_path / "soup.ply"
+
+
+def one(**fields):
+    """A Gaussian of deviations 1 and 0.5 in the plane z = 2."""
+    means, quats, log_scales = np.array([[0.0, 0, 2]]), np.array([[1.0, 0, 0, 0]]), np.log([[1.0, 0.5, 0.01]])
+    plain = Gaussians(means, quats, log_scales, np.full(1, 4.0), np.zeros((1, 3)), np.zeros((1, 0, 3)))
+    return plain._replace(**fields)
 
 
 # --- there and back ---
@@ -134,6 +143,25 @@ def test_one_moved_vertex_changes_one_gaussian(files, tmp_path, capsys):
     others = np.delete(np.arange(30), row)
     assert is_same([f[others] for f in after], [f[others] for f in before])
     assert after.means[row, 1] - before.means[row, 1] == pytest.approx(0.05 / 8, rel=1e-3)
+
+
+def test_a_soup_has_colour_and_opacity_in_bytes(tmp_path):
+    """0.2, 0.5 and 0.8 are 51, 127.5 and 204 of 255, and so is an opacity of 0.8."""
+    colored = one(sh_dc=np.array([[-0.3, 0.0, 0.3]]) / SH_C0, opacity_logits=np.log([4.0]))
+    save_soup(tmp_path / "soup.ply", colored, 5)
+    columns = read_vertices(tmp_path / "soup.ply")
+    for name, level in zip(("red", "green", "blue", "alpha"), (51, 128, 204, 204), strict=True):
+        assert columns[name].tolist() == [level] * 5
+
+
+def test_a_polygon_may_be_narrow_but_not_a_line():
+    gaussians = one()
+    soup = soup_of(gaussians, 8)
+    narrow, n_edited = carry_gaussians(gaussians, soup, soup.corners * [1, 1e-4, 1], "soup.ply")
+    assert n_edited == 1
+    assert_allclose(np.exp(np.sort(narrow.log_scales[0]))[1:], [0.5e-4, 1], rtol=1e-6)
+    with pytest.raises(InputError, match="polygon 0 has no area"):
+        carry_gaussians(gaussians, soup, soup.corners * [1, 1e-10, 1], "soup.ply")
 
 
 def test_a_run_and_other_numbers_of_sides(tmp_path, rng):

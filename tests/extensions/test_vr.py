@@ -175,6 +175,18 @@ def test_weighted_psnr_counts_the_fovea(rng):
     assert measures.weighted_psnr(near, target, angles) < measures.weighted_psnr(far, target, angles) - 15
 
 
+@pytest.mark.parametrize("gaze", [Gaze(0, 0, 0), Gaze(80, 60, 180), Gaze(70, 5, 8)])
+def test_a_gaze_anywhere_in_the_image_is_accepted(gaze):
+    foveation.check_gaze(gaze, CAMERA)
+
+
+def test_blocks_at_the_edges_extend_beyond_the_image():
+    camera = make_camera(77, 53, fx=60.0, fy=50.0)
+    coarse = foveation._coarser(camera, 4)
+    assert (coarse.width, coarse.height, coarse.fx, coarse.fy) == (20, 14, 15, 12.5)
+    assert (coarse.cx, coarse.cy) == (camera.cx / 4, camera.cy / 4)
+
+
 @pytest.mark.parametrize("gaze", [Gaze(-1, 5, 8), Gaze(81, 5, 8), Gaze(5, 60.5, 8), Gaze(np.nan, 5, 8), Gaze(5, 5, -1)])
 def test_a_gaze_outside_is_refused(gaze, rng):
     with pytest.raises(InputError, match=r"gaze .* lies outside image|--full is -1 degrees"):
@@ -201,6 +213,11 @@ def test_a_queue_by_hand():
     assert queues.pass_queue([3.0, 1.0, 2.0, 0.0, 0.0], 1) == ([0, 1, 2, 3, 4], 0)
     assert queues.pass_queue([3.0, 1.0, 2.0, 0.0, 0.0], 9) == ([3, 4, 1, 2, 0], 1 + 1 + 3 + 3)
     assert queues.pass_queue([], 3) == ([], 0)
+
+
+def test_the_hierarchy_has_the_published_queues():
+    """64 for blocks of 4 x 4 pixels, 8 for 2 x 2, 4 for each pixel."""
+    assert queues.HIERARCHY.queues == ((4, 64), (2, 8), (1, 4)) and queues.HIERARCHY.first == "tile"
 
 
 def line_of_rays(depths, alphas):
@@ -242,6 +259,8 @@ def test_the_exact_order_draws_what_the_renderer_draws(rng):
     camera = make_camera(21, 18, fx=20.0, fy=20.0)
     images, works = queues.draw(prepare(model, camera, REQUEST, None), queues.ORDERS)
     named = {stages.name: (image, work) for stages, image, work in zip(queues.ORDERS, images, works, strict=True)}
+    n_listed = len(prepare(model, camera, REQUEST, None).listed().gaussian_ids)
+    assert named["list by depth in the tile"][1].n_depths == n_listed  # one for each Gaussian of each tile
     for name, buffer_size in (("exact order", None), ("buffer of 16 per pixel", 16)):
         expected = render(model, view_from(camera), REQUEST, buffer_size=buffer_size)[0].image
         assert_allclose(named[name][0], expected, atol=1e-12)

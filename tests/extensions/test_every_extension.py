@@ -1,27 +1,37 @@
-"""What every extension has of its own has the gradient that it says, along random directions, on the reference.
+"""What holds for every extension, by the reference: its gradients, and that a scene may lie anywhere.
 
-Nothing is named here, so a new extension is checked, too. It is the quick part of ``oracle gradients --extension
-NAME``: no Jacobians, no kernels, which the tests of each extension hold against the reference, and the wider limit.
+A new extension is checked, too, without a line here. Gradients are the quick part of ``oracle gradients --extension
+NAME``: along random directions, without Jacobians, with the wider limit; kernels are held against the reference by the
+tests of each extension.
 """
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extensions
+from minisplat_ref.io.frames import place_camera, place_fields
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.oracle.differences import careful_derivative, check_inner_products, settled_derivative
 from minisplat_ref.oracle.gradients import MANY_STEPS
 from minisplat_ref.oracle.loss_terms import LARGER, loss_stage, own_terms, stage_name
-from minisplat_ref.oracle.models import model_stages
+from minisplat_ref.oracle.models import model_stages, noisy_model, training_view
 from minisplat_ref.oracle.pieces import SEED
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL_NEAR_THRESHOLD
+from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import GAUSSIANS
+from minisplat_ref.types import Frame, Model
+from tolerances import PARITY_FLOAT64
 
 EXTENSIONS = {extension.name: extension for extension in load_extensions()}
+FRAME = Frame((3.0, -2.0, 5.0), 0.25)
 WITHOUT = {"compression", "proxies", "segment"}  # formats, edits and labels: nothing that has a gradient
+
+
+# Gradients
 
 
 def stages_of(extension, rng):
@@ -70,3 +80,26 @@ def test_what_has_no_gradient(name):
     extension = EXTENSIONS[name]
     assert extension.representation == GAUSSIANS and extension.stages is None
     assert not extension.losses and not extension.recipes
+
+
+# Frames
+
+
+@pytest.mark.parametrize("name", sorted(EXTENSIONS.keys() - {"satellite"}))
+def test_a_scene_is_drawn_alike_wherever_it_lies(name):
+    """In other units about another origin, fields and shared parameters as their units say, the image is the same.
+
+    The cameras of ``satellite`` have a number of pixels for a unit of length, whatever their place; its scenes come in
+    a frame of their own.
+    """
+    representation, rng = EXTENSIONS[name].representation, np.random.default_rng(SEED)
+    setting = make_setting(rng, 20, 20, 15, GSPLAT_MAIN, sh_degree=3)
+    view = training_view(setting.camera)
+    model, _ = noisy_model(setting, view, representation, rng)
+    fields = place_fields(model.gaussians._asdict(), representation.units, FRAME)
+    moved = Model(type(model.gaussians)(**fields), place_fields(model.shared, representation.units, FRAME))
+    request = Request(setting.background, conventions=GSPLAT_MAIN, backend=REFERENCE)
+    seen_from = view._replace(camera=place_camera(view.camera, FRAME))
+    image = representation.renderer.render(model, view, request)[0].image
+    assert image.std() > 0.05
+    assert_allclose(representation.renderer.render(moved, seen_from, request)[0].image, image, atol=PARITY_FLOAT64)
