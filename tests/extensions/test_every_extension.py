@@ -1,4 +1,4 @@
-"""What holds for every extension, by the reference: its gradients, and that a scene may lie anywhere.
+"""What holds for every extension, by the reference: its gradients, and what its image does not depend on.
 
 A new extension is checked, too, without a line here. Gradients are the quick part of ``oracle gradients --extension
 NAME``: along random directions, without Jacobians, with the wider limit; kernels are held against the reference by the
@@ -22,9 +22,10 @@ from minisplat_ref.oracle.pieces import SEED
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL_NEAR_THRESHOLD
 from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.types import Frame, Model
-from tolerances import PARITY_FLOAT64
+from tolerances import PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 EXTENSIONS = {extension.name: extension for extension in load_extensions()}
 FRAME = Frame((3.0, -2.0, 5.0), 0.25)
@@ -82,7 +83,62 @@ def test_what_has_no_gradient(name):
     assert not extension.losses and not extension.recipes
 
 
-# Frames
+# Images
+
+
+class Drawing:
+    """A model of an extension with noise in what is its own, and its image."""
+
+    def __init__(self, extension):
+        self.representation, rng = extension.representation, np.random.default_rng(SEED)
+        setting = make_setting(rng, 20, 20, 15, GSPLAT_MAIN, sh_degree=3)
+        self.view = training_view(setting.camera)
+        self.model, _ = noisy_model(setting, self.view, self.representation, rng)
+        self.request = Request(setting.background, conventions=GSPLAT_MAIN, backend=REFERENCE)
+        self.image = self.drawn(self.model).image
+        assert self.image.std() > 0.05
+
+    def drawn(self, model, **changes):
+        return self.representation.renderer.render(model, self.view, self.request._replace(**changes))[0]
+
+    def of_rows(self, rows):
+        return self.model._replace(gaussians=take(self.model.gaussians, rows))
+
+
+@pytest.fixture(scope="module", params=sorted(EXTENSIONS))
+def drawing(request):
+    return Drawing(EXTENSIONS[request.param])
+
+
+def test_the_order_of_rows_has_no_meaning(drawing, rng):
+    rows = rng.permutation(len(drawing.model.gaussians.means))
+    assert_allclose(drawing.drawn(drawing.of_rows(rows)).image, drawing.image, atol=PARITY_FLOAT64)
+
+
+def test_a_hidden_row_is_as_one_that_is_not_there(drawing):
+    is_visible = np.arange(len(drawing.model.gaussians.means)) % 3 > 0
+    hidden = drawing.drawn(drawing.model, is_visible=is_visible).image
+    assert_allclose(hidden, drawing.drawn(drawing.of_rows(np.flatnonzero(is_visible))).image, atol=PARITY_FLOAT64)
+    assert np.abs(hidden - drawing.image).max() > 0.01
+
+
+def test_nothing_is_drawn_of_no_rows(drawing):
+    output = drawing.drawn(drawing.of_rows(np.zeros(0, int)))
+    assert not output.alpha.any() and np.isfinite(output.image).all() and len(output.visible_ids) == 0
+
+
+def test_float32_stays_float32(drawing):
+    population, shared = drawing.model.gaussians, drawing.model.shared
+    fields = type(population)(*(field.astype(np.float32) for field in population))
+    model = Model(fields, {name: array.astype(np.float32) for name, array in shared.items()})
+    request = drawing.request._replace(background=drawing.request.background.astype(np.float32))
+    renderer = drawing.representation.renderer
+    output, tape = renderer.render(model, drawing.view, request)
+    assert output.image.dtype == output.alpha.dtype == np.float32
+    assert_allclose(output.image, drawing.image, atol=PARITY_FLOAT32_IMAGE)
+    v = renderer.render_vjp(tape, np.ones_like(output.image), np.ones_like(output.alpha))
+    wide = {name for name, array in {**v.gaussians._asdict(), **v.shared}.items() if array.dtype != np.float32}
+    assert wide == set()
 
 
 @pytest.mark.parametrize("name", sorted(EXTENSIONS.keys() - {"satellite"}))
@@ -92,14 +148,10 @@ def test_a_scene_is_drawn_alike_wherever_it_lies(name):
     The cameras of ``satellite`` have a number of pixels for a unit of length, whatever their place; its scenes come in
     a frame of their own.
     """
-    representation, rng = EXTENSIONS[name].representation, np.random.default_rng(SEED)
-    setting = make_setting(rng, 20, 20, 15, GSPLAT_MAIN, sh_degree=3)
-    view = training_view(setting.camera)
-    model, _ = noisy_model(setting, view, representation, rng)
+    drawing = Drawing(EXTENSIONS[name])
+    model, view, representation = drawing.model, drawing.view, drawing.representation
     fields = place_fields(model.gaussians._asdict(), representation.units, FRAME)
     moved = Model(type(model.gaussians)(**fields), place_fields(model.shared, representation.units, FRAME))
-    request = Request(setting.background, conventions=GSPLAT_MAIN, backend=REFERENCE)
     seen_from = view._replace(camera=place_camera(view.camera, FRAME))
-    image = representation.renderer.render(model, view, request)[0].image
-    assert image.std() > 0.05
-    assert_allclose(representation.renderer.render(moved, seen_from, request)[0].image, image, atol=PARITY_FLOAT64)
+    image = representation.renderer.render(moved, seen_from, drawing.request)[0].image
+    assert_allclose(image, drawing.image, atol=PARITY_FLOAT64)
