@@ -3,8 +3,9 @@
 ``data_tools.mutation`` draws its changes; what it draws in a module of formulas is mostly noticed at once. The changes
 of ``rule_changes.toml`` were chosen by a reader instead, as the mistakes that look right: a threshold doubled, a date
 moved, a mean for a median, a condition left out. Each replaces a text that stands once in its file by another. They are
-tested by the table of published constants and by the files that import the module, the nearest first, for a bounded
-time, so a survivor may be noticed by a test that was not run. All happens in a copy of the working tree.
+tested by the table of published constants, by the files that import the module, the nearest first, and by what holds
+for every extension, for a bounded time, so a survivor may be noticed by a test that was not run. All happens in a copy
+of the working tree.
 
 A change whose text is gone from the code is named and left out. Whoever edits such a line edits the change, too, or
 deletes it.
@@ -26,7 +27,8 @@ from minisplat_ref.arguments import HelpFormatter, Parser, integer
 
 CHANGES = Path(__file__).with_suffix(".toml")
 FILES_MAX = 6  # of tests for a change, those nearest to the module
-TABLE = Path("tests/extensions/test_published.py")  # of all recipes, which it finds by their names, not by imports
+TABLE = Path("tests/extensions/test_published.py")  # of all recipes; like the next it finds them by their names
+RULES = Path("tests/extensions/test_every_extension.py")
 HANGS = 300  # seconds beyond those of the tests: then a change has made something endless, which counts as noticed
 
 
@@ -78,7 +80,7 @@ def outcomes(changes: Sequence[Change], seconds: int) -> Iterator[tuple[Change, 
         try:
             for change in changes:
                 nearest = imports.tests_of(change.path)[:FILES_MAX]
-                yield change, is_noticed(change, [TABLE, *nearest], seconds)
+                yield change, is_noticed(change, [TABLE, *nearest, RULES], seconds)
         finally:
             os.chdir(home)
 

@@ -60,6 +60,7 @@ def test_the_sums_are_printed(tests, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["rule_changes", "--changes", "changes.toml", "--seconds", "60"])
     monkeypatch.setattr(rule_changes, "copy_tree", lambda folder: Path.cwd())
     monkeypatch.setattr(rule_changes, "TABLE", tests[0])
+    monkeypatch.setattr(rule_changes, "RULES", tests[0])
     monkeypatch.setattr(rule_changes.Imports, "tests_of", lambda self, path: tests)
     main()
     lines = capsys.readouterr().out.splitlines()
