@@ -17,7 +17,7 @@ from minisplat_ref.methods import RECIPES
 from minisplat_ref.oracle.differences import careful_derivative, check_inner_products, settled_derivative
 from minisplat_ref.oracle.gradients import MANY_STEPS
 from minisplat_ref.oracle.loss_terms import LARGER, loss_stage, own_terms, stage_name
-from minisplat_ref.oracle.models import model_stages, noisy_model, training_view
+from minisplat_ref.oracle.models import model_settings, model_stages, noisy_model, training_view
 from minisplat_ref.oracle.pieces import SEED
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL_NEAR_THRESHOLD
@@ -35,15 +35,15 @@ WITHOUT = {"compression", "proxies", "segment"}  # formats, edits and labels: no
 # Gradients
 
 
-def stages_of(extension, rng):
-    """The renderer and further stages on 20 Gaussians, and the loss terms on the first scene in which each acts."""
+def stages_of(extension):
+    """The renderer and further stages on the oracle's larger scene, and loss terms on the first in which each acts."""
     representation = None if extension.representation == GAUSSIANS else extension.representation
-    setting = make_setting(rng, 20, 20, 15, GSPLAT_MAIN, sh_degree=3)
+    _, setting, rng = model_settings(GSPLAT_MAIN)
     stages = model_stages(REFERENCE, setting, representation, extension.stages, rng)
     core = [term for recipe in RECIPES.values() for term in recipe.losses]
     terms = own_terms([*extension.losses, *(t for recipe in extension.recipes for t in recipe.losses)], core)
     losses = [first_acting(term, extension, rng) for term in terms if stage_name(term) not in {s.name for s in stages}]
-    return [*((stage, careful_derivative) for stage in stages), *((stage, settled_derivative) for stage in losses)]
+    return rng, [*((stage, careful_derivative) for stage in stages), *((stage, settled_derivative) for stage in losses)]
 
 
 def first_acting(term, extension, rng):
@@ -57,8 +57,7 @@ def first_acting(term, extension, rng):
 
 @pytest.mark.parametrize("name", sorted(EXTENSIONS.keys() - WITHOUT))
 def test_gradients_along_random_directions(name):
-    rng = np.random.default_rng(SEED)
-    stages = stages_of(EXTENSIONS[name], rng)
+    rng, stages = stages_of(EXTENSIONS[name])
     assert stages
     for stage, differentiate in stages:
         products = check_inner_products(

@@ -31,6 +31,7 @@ centres, for which there is ``minisplat-ref mesh``.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.mvg.method import MVG
+from minisplat_ref.extensions.mvg.stages import stages
 from minisplat_ref.mechanisms.surfels.discs import DISCS
 from minisplat_ref.studies.study import OUT, declare, number, seeds, synthetic_scene
 
@@ -40,4 +41,4 @@ INSERTION = declare(
     f"{__name__}.study.run",
     *(synthetic_scene(), OUT, number("--views", 12, "of 240 x 180 pixels", minimum=3), seeds(3)),
 )
-EXTENSION = Extension("mvg", recipes=(MVG,), representation=DISCS, studies=(INSERTION,))
+EXTENSION = Extension("mvg", recipes=(MVG,), representation=DISCS, stages=stages, studies=(INSERTION,))

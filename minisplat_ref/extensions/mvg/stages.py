@@ -1,0 +1,14 @@
+"""The stage of the gradient check: the surfels' renderer, which says on which side of its steps a point is."""
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.mechanisms.surfels.discs import DISCS
+from minisplat_ref.mechanisms.surfels.stages import renderer_stage
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return it; the loss terms need none of their own."""
+    return (renderer_stage(backend, setting, DISCS, rng),)
