@@ -1,4 +1,4 @@
-"""What the tools that change the code must know of the sources: which test files import a module, where types stand."""
+"""What the tools that change the code need: a copy of it, the test files that import a module, where types stand."""
 
 import ast
 import shutil

@@ -72,15 +72,15 @@ def largest_error(errors: Sequence[float]) -> float:
     return float(np.max(errors)) if len(errors) else np.nan
 
 
-def relative_error(got: Floats, expected: Floats) -> float:
+def relative_error(got: Floats, expected: Floats, floor: float = 0.0) -> float:
     """Return the largest difference of two arrays relative to the largest value expected.
 
-    It is absolute where all that is expected is below ``GRADIENT_FLOOR``, and infinite where the shapes differ.
+    It is absolute where nothing expected is above ``floor``, and infinite where the shapes differ.
     """
     if np.shape(got) != np.shape(expected):
         return np.inf
     size = float(np.abs(expected).max(initial=0.0))
-    return float(np.abs(got - expected).max(initial=0.0)) / (size if size > GRADIENT_FLOOR else 1.0)
+    return float(np.abs(got - expected).max(initial=0.0)) / (size if size > floor else 1.0)
 
 
 class JacobianCheck(NamedTuple):

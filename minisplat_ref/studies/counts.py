@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.rendering import RenderSettings
@@ -111,6 +112,9 @@ def draw(records: Sequence[Mapping[str, Any]], curves: Mapping[str, Curve]) -> F
             axes.plot(*np.transpose(sorted(map(tuple, means))), "-", color=curve.color, label=name)
             axes.plot(*np.transpose(own), "o", ms=3, color=curve.color)
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.minorticks_off()
         axes.set(xlabel="Gaussians", ylabel="test PSNR (dB)", title=heading)
     axes.legend()
     return figure

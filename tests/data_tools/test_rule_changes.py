@@ -55,14 +55,25 @@ def test_the_changes_of_the_repository_are_of_its_files():
     assert len(set(changes)) == len(changes) > 300
 
 
-def test_the_sums_are_printed(tests, monkeypatch, capsys):
+@pytest.fixture
+def command(tests, monkeypatch):
     Path("changes.toml").write_text('"rules.py" = [["STEP = 3", "STEP = 4"], ["x > ", "x < "], ["y", "z"]]\n')
     monkeypatch.setattr("sys.argv", ["rule_changes", "--changes", "changes.toml", "--seconds", "60"])
     monkeypatch.setattr(rule_changes, "copy_tree", lambda folder: Path.cwd())
     monkeypatch.setattr(rule_changes, "TABLE", tests[0])
     monkeypatch.setattr(rule_changes, "RULES", tests[0])
     monkeypatch.setattr(rule_changes.Imports, "tests_of", lambda self, path: tests)
-    main()
+    return main
+
+
+def test_tests_that_fail_without_a_change_say_nothing(command):
+    Path("rules.py").write_text(CODE.replace("LIMIT = 3", "LIMIT = 5"))
+    with pytest.raises(SystemExit, match=r"rules\.py: its tests fail without a change: test_rules\.py"):
+        command()
+
+
+def test_the_sums_are_printed(command, capsys):
+    command()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "1/3 survived rules.py: 'STEP = 3' -> 'STEP = 4'"
     assert lines[1].startswith("2/3 noticed") and lines[2].startswith("3/3 gone")

@@ -316,7 +316,7 @@ def test_study_of_a_ply(run, tmp_path, capsys):
     ]
     assert drops["ply"] == drops["sog"] == drops["msz 0"] == 0.0
     assert abs(drops["msz 1"]) < 0.2 * abs(drops["msz 12"])
-    (kept,) = result["spz_beside_harmonics"]
+    (kept,) = result["spz_apart_from_harmonics"]
     assert kept != drops["spz version 3"] and abs(kept) < 0.1
     assert sizes["ply"] == sizes["sog"] == (run / "point_cloud.ply").stat().st_size
     assert sizes["msz 5"] == len(msz.encode(load_ply(run / "point_cloud.ply"), 5))
@@ -324,7 +324,7 @@ def test_study_of_a_ply(run, tmp_path, capsys):
     assert "bytes per Gaussian" in capsys.readouterr().out
 
 
-def test_what_spz_loses_beside_its_harmonics(run):
+def test_what_spz_loses_apart_from_its_harmonics(run):
     """With harmonics in SPZ's own steps the two losses are the same, and with others they are not."""
     scene, gaussians = load_scene(run.parent / "nook"), load_ply(run / "point_cloud.ply")
     rounded = gaussians._replace(sh_rest=spz.SPZ.decode(spz.SPZ.encode(gaussians, 0), "").sh_rest)
@@ -333,7 +333,7 @@ def test_what_spz_loses_beside_its_harmonics(run):
         psnr = rate_distortion.mean_psnr(model, scene.test_views, scene.background)
         back = rate_distortion.round_trip(model, spz.SPZ, 0)[1]
         drop = psnr - rate_distortion.mean_psnr(back, scene.test_views, scene.background)
-        kept = rate_distortion.drop_beside_harmonics(model, scene.test_views, scene.background, psnr)
+        kept = rate_distortion.drop_apart_from_harmonics(model, scene.test_views, scene.background, psnr)
         assert (kept == drop) is is_same
 
 

@@ -297,9 +297,11 @@ def test_the_largest_error_is_nan_where_one_is(place):
     assert JacobianCheck(blocks[:place] + blocks[place + 1 :], 1e-6, 0).error == (0.2 if place == 1 else 0.3)
 
 
-def test_a_relative_error_is_by_the_largest_value_and_absolute_near_zero():
+def test_a_relative_error_is_by_the_largest_value_and_absolute_up_to_the_floor():
     assert relative_error(np.array([3.0, -7.0]), np.array([4.0, -8.0])) == 1 / 8
     assert relative_error(np.array([3e-7]), np.zeros(1)) == 3e-7
+    assert relative_error(np.array([3e-7]), np.array([1e-7])) == pytest.approx(2)
+    assert relative_error(np.array([3e-7]), np.array([1e-7]), 1e-6) == pytest.approx(2e-7)
     assert relative_error(np.zeros(2), np.zeros(3)) == np.inf
     assert np.isnan(relative_error(np.array([np.nan, 0.0]), np.ones(2)))
     assert relative_error(np.zeros(0), np.zeros(0)) == 0.0

@@ -67,11 +67,11 @@ def run(args: argparse.Namespace) -> kit.Report:
         counts.append(len(gaussians.means))
         files = rate_points(gaussians, scene.test_views, scene.background, psnrs[-1], args.splat_transform)
         runs.append([point._asdict() for point in kit.with_progress(files, "files")])
-        kept.append(drop_beside_harmonics(gaussians, scene.test_views, scene.background, psnrs[-1]))
+        kept.append(drop_apart_from_harmonics(gaussians, scene.test_views, scene.background, psnrs[-1]))
         shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
     drops = {name: [of_seed[name] for of_seed in shrunk] for name in shrunk[0]}
     result = {**kit.describe_trainings(args, scene), "psnr": psnrs, "gaussians": counts, "runs": runs, "shrunk": drops}
-    result |= {"spz_beside_harmonics": kept}
+    result |= {"spz_apart_from_harmonics": kept}
     text = f"{scene.name}: {with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n\n"
     text += markdown_table(["file", "bytes", "bytes per Gaussian", "dB lost"], to_rows(runs))
     text += f"\n\n.spz with the harmonics kept as they are loses {with_deviation(kept, 3)} dB"
@@ -116,7 +116,7 @@ def round_trip(gaussians: Gaussians, format_: Format, level: int) -> tuple[bytes
     return content, format_.decode(content, format_.suffix)
 
 
-def drop_beside_harmonics(gaussians: Gaussians, views: tuple[View, ...], background: Floats, psnr: float) -> float:
+def drop_apart_from_harmonics(gaussians: Gaussians, views: tuple[View, ...], background: Floats, psnr: float) -> float:
     """Return the loss of an ``.spz``, dB, if the harmonics of degree 1 and above were kept as they are."""
     back = round_trip(gaussians, SPZ, 0)[1]
     return psnr - mean_psnr(back._replace(sh_rest=gaussians.sh_rest), views, background)
