@@ -1,9 +1,11 @@
 """Check the subject of a commit: conventional form, and at most 72 characters, which git and its viewers show in full.
 
 ``.pre-commit-config.yaml`` calls it with the file of the message: ``python -m data_tools.commit_subject FILE``.
+``.ci/run`` calls it for new commits: ``python -m data_tools.commit_subject --since COMMIT``, on which they are based.
 """
 
 import re
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,14 +33,29 @@ def subject_of(message: str) -> str:
     return next((line for line in lines if line and not line.startswith("#")), "")
 
 
+def subjects_since(commit: str) -> list[str]:
+    """Return the subjects of the commits of this checkout that a commit does not have, without merges.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        There is no such commit; git says so on stderr.
+    """
+    command = ["git", "log", "--no-merges", "--format=%s", f"{commit}..HEAD"]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, encoding="utf-8", check=True).stdout.splitlines()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check the message in a file; return 1, with a line on stderr, if something is wrong with its subject."""
-    (path,) = sys.argv[1:] if arguments is None else arguments
-    subject = subject_of(Path(path).read_text(encoding="utf-8"))
-    fault = find_fault(subject)
-    if fault is not None:
+    """Check the message in a file, or new commits; return 1, with lines on stderr, if something is wrong."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if words[0] == "--since":
+        subjects = subjects_since(words[1])
+    else:
+        subjects = [subject_of(Path(words[0]).read_text(encoding="utf-8"))]
+    faults = [(subject, fault) for subject in subjects if (fault := find_fault(subject)) is not None]
+    for subject, fault in faults:
         print(f"{subject}\n{fault}", file=sys.stderr)
-    return int(fault is not None)
+    return int(bool(faults))
 
 
 if __name__ == "__main__":
