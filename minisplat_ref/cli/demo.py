@@ -1,4 +1,4 @@
-"""``demo``: makes a scene, trains it, and shows what came out of it in one page."""
+"""``demo``: makes a scene, trains it, and shows the result in a page and a report."""
 
 import argparse
 import itertools
@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from minisplat_ref.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.cli.steps import do
 from minisplat_ref.progress import with_progress
 
 SCENE = {"n_views": 28, "width": 192, "height": 144, "n_points": 8000, "seed": 0, "test_every": 8}
@@ -19,8 +20,9 @@ DEFAULT_OUT = "minisplat-demo"
 DESCRIPTION = f"""\
 See the program work, with nothing to download: ray-trace photographs of a
 small room, train Gaussians on them (the first {ITERATIONS} iterations of recipe
-{RECIPE}), measure views that the training never saw, and write report.html:
-images, depth against the exact depth, curves, and what to try next.
+{RECIPE}), and measure views that the training never saw. It writes
+scene.html, which shows the room in any browser, and report.html: images, depth
+against the exact depth, curves, and what to try next.
 
 Takes a minute or two on two cores. The folder that it leaves is a run like
 those of train, with the photographs in DIR/scene.
@@ -54,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.runs import run_folder
     from minisplat_ref.runs.demo_report import report_html, view_images
     from minisplat_ref.runs.first_use import compile_kernels
+    from minisplat_ref.runs.next_steps import PAGE, live_view
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
     from minisplat_ref.runs.settings import Settings, load_photographs, recipe_of
@@ -94,7 +97,11 @@ def run(args: argparse.Namespace) -> int:
         print(f"minisplat-ref: stopped after {state.step} iterations, report of these: {report}", file=sys.stderr)
         return 130
     print(f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians")
-    print(f"open {(folder / run_folder.REPORT).resolve()}")
+    do("convert", folder, folder / PAGE)
+    live = live_view(folder)
+    print(f"the room, in any browser: open {(folder / PAGE).resolve()}")
+    print(f"how good it is, and what to try next: open {(folder / run_folder.REPORT).resolve()}")
+    print(f"{live.purpose.lower()}: {live.line}")
     return 0
 
 

@@ -1,23 +1,25 @@
-"""``photos``: from a folder of photographs to a report and a film, in one command."""
+"""``photos``: from a folder of photographs to a page that shows the scene, a film and a report, in one command."""
 
 import argparse
 from pathlib import Path
 
 from minisplat_ref.arguments import Commands, HelpFormatter, integer, positive
 from minisplat_ref.cli.sfm import MATCHINGS
+from minisplat_ref.cli.steps import do
 from minisplat_ref.errors import InputError
 
-SCENE, RUN, FILM = "scene", "run", "film.gif"
+SCENE, RUN, PAGE, FILM = "scene", "run", "scene.html", "film.gif"
 
 DESCRIPTION = """\
 Make a 3D model of what photographs show: find their cameras, choose a size that
-a laptop trains in minutes, train, and make a film along the photographer's
-path. It prints the command of each step, which can be given alone to choose
-more. DIR will hold:
+a laptop trains in minutes, train, and write a page that shows the scene in any
+browser, and a film along the photographer's path. It prints the command of each
+step, which can be given alone to choose more. DIR will hold:
 
-  scene/     the photographs with their cameras, a COLMAP scene (sfm)
-  run/       report.html, point_cloud.ply, metrics.json and more (train)
-  film.gif   (render)
+  scene/       the photographs with their cameras, a COLMAP scene (sfm)
+  run/         report.html, point_cloud.ply, metrics.json and more (train)
+  scene.html   the scene, to look at offline and to send (convert)
+  film.gif     (render)
 
 Some 20 to 60 photographs of something that stands still, taken from places a
 step apart, with a lot of overlap, are a good start. After an interruption the
@@ -33,7 +35,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "photos",
-        help="your photographs: cameras, training, film and report",
+        help="your photographs: cameras, training, page, film and report",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
@@ -61,40 +63,36 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.datasets.video import is_video
     from minisplat_ref.reports.commands import command
     from minisplat_ref.runs import run_folder, settings
+    from minisplat_ref.runs.next_steps import live_view
 
     path = args.photos.resolve()
     folder = args.out or Path("splats") / (path.stem if is_video(path) else path.name)
-    scene, trained, film = (folder / name for name in (SCENE, RUN, FILM))
+    scene, trained, page, film = (folder / name for name in (SCENE, RUN, PAGE, FILM))
     if not args.photos.is_dir() and not is_video(args.photos):
         raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")
     if not scene.exists():
         matching = () if args.matching is None else ("--matching", args.matching)
-        _do("sfm", args.photos, "--out", scene, *matching)
+        do("sfm", args.photos, "--out", scene, *matching)
     if not run_folder.has_begun(trained):
         factor = _choose_factor(scene) if args.downscale is None else args.downscale
         limit = () if args.minutes is None else ("--minutes", f"{args.minutes:g}")
-        code = _do("train", scene, "--downscale", str(factor), *limit, "--out", trained)
+        code = do("train", scene, "--downscale", str(factor), *limit, "--out", trained)
     elif not run_folder.is_finished(trained, settings.load(trained).iterations):
-        code = _do("train", "--resume", trained)
+        code = do("train", "--resume", trained)
     else:
         code = 0
     if code != 0:
         return code
+    if not page.exists():
+        do("convert", trained, page)
     if not film.exists():
-        _do("render", trained, "--cameras", "orbit", "--film", film)
-    print(f"open {(trained / run_folder.REPORT).resolve()}")
-    print(f"smaller: {command('simplify', trained, '--out', folder / 'small')}")
+        do("render", trained, "--cameras", "orbit", "--film", film)
+    live = live_view(trained)
+    print(f"the scene, in any browser: open {page.resolve()}")
+    print(f"how good it is, and what to try next: open {(trained / run_folder.REPORT).resolve()}")
+    print(f"{live.purpose.lower()}: {live.line}")
+    print(f"make it smaller: {command('simplify', trained, '--out', folder / 'small')}")
     return 0
-
-
-def _do(*words: str | Path) -> int:
-    """Print a command, and run it."""
-    from minisplat_ref.cli import build_parser
-    from minisplat_ref.reports.commands import command
-
-    print(f"$ {command(*words)}", flush=True)
-    args = build_parser().parse_args([str(word) for word in words])
-    return args.run(args)
 
 
 def _choose_factor(scene: Path) -> int:

@@ -238,7 +238,7 @@ def _start(given: dict[str, Any]) -> int:
     room = _check_room(scene, state, settings)
     compile_kernels(settings.backend)
     run_folder.create(folder)
-    warn_of_scene(scene, settings.downscale, is_dense=recipe.starts_densely)
+    warn_of_scene(scene, is_dense=recipe.starts_densely)
     if settings.block is None:  # else the training of the whole has said so
         report_inventory(Path(settings.scene), scene, settings.model)
     proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
@@ -415,6 +415,7 @@ def _train(
 ) -> int:
     from minisplat_ref.runs import checkpoints, run_folder
     from minisplat_ref.runs.model_file import describe_parts, missing_parts
+    from minisplat_ref.runs.next_steps import ways_to_look
     from minisplat_ref.runs.notices import describe_place, describe_sizes
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
@@ -448,7 +449,9 @@ def _train(
             f"point_cloud.ply does not hold {describe_parts(parts)}, which other programs therefore leave out;"
             f" minisplat-ref render {folder} has all"
         )
-    print(f"open {(folder / run_folder.REPORT).resolve()}")
+    for step in ways_to_look(folder, state.gaussians._fields):
+        print(f"{step.purpose.lower()}: {step.line}")
+    print(f"how good it is, and what to try next: open {(folder / run_folder.REPORT).resolve()}")
     return _simplify(folder, settings)
 
 

@@ -9,7 +9,14 @@ from pathlib import Path
 from minisplat_ref.datasets.photo_files import list_images
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.io.images import downscaled_size, read_image, resize_image, write_image
+from minisplat_ref.io.images import (
+    check_downscale,
+    downscaled_size,
+    image_size,
+    read_image,
+    resize_image,
+    write_image,
+)
 from minisplat_ref.progress import with_progress
 
 
@@ -31,13 +38,14 @@ def downscale_images(images: Path, factor: int) -> Path:
     Raises
     ------
     InputError
-        If there are no images, one cannot be read, or the new folder is already there.
+        If there are no images, one cannot be read or would be too small, or the new folder is already there.
     """
     if factor < 2:
         raise InputError(f"--downscale is {factor}; it must be at least 2")
     files = list_images(images)
     target = images.with_name(f"{images.name}_{factor}")
     with making_folder(target) as folder:
+        check_downscale(images, map(image_size, files), factor)
         for file in with_progress(files, target.name, "photographs"):
             image = read_image(file)
             small = folder / file.relative_to(images)

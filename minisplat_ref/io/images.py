@@ -15,7 +15,7 @@ import struct
 import threading
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -50,6 +50,7 @@ DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
     *(RuntimeError, struct.error, zlib.error),
 )
 _LOCK = threading.Lock()  # Pillow's limit and Python's warning filters are shared by all threads
+SIDE_MIN = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 
@@ -265,6 +266,34 @@ def mask_areas(mask: Bools, width: int, height: int) -> Floats:
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
     """Return width and height in pixels after division by ``factor``, rounded, at least 1."""
     return max(1, round(width / factor)), max(1, round(height / factor))
+
+
+def check_downscale(source: str | Path, sizes: Iterable[tuple[int, int]], factor: int) -> None:
+    """Refuse to make photographs smaller than :data:`SIDE_MIN`; those that are so small themselves pass.
+
+    Parameters
+    ----------
+    source : str or Path
+        Scene or folder, for the message.
+    sizes : iterable of (int, int)
+        Width and height of the photographs, pixels.
+    factor : int
+        At least 1.
+
+    Raises
+    ------
+    InputError
+        Names the size, and the largest factor that all photographs allow.
+    """
+    smallest = min(sizes, key=min, default=None)
+    if smallest is None or factor == 1 or min(downscaled_size(*smallest, factor)) >= SIDE_MIN:
+        return
+    width, height = downscaled_size(*smallest, factor)
+    largest = max(1, min(smallest) // SIDE_MIN)
+    raise InputError(
+        f"{source}: --downscale {factor} leaves {width} x {height} pixels of a photograph, and hardly any structure can"
+        f" be learned from fewer than {SIDE_MIN} x {SIDE_MIN}: give at most {largest}"
+    )
 
 
 def write_image(path: str | Path, image: NDArray) -> None:

@@ -78,6 +78,11 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
+def link(text: str, target: str) -> str:
+    """Return a line that leads to a file beside the page."""
+    return f'<p><a href="{escape(target)}">{escape(text)}</a></p>'
+
+
 def make_list(texts: Iterable[str]) -> str:
     """Return sentences as a list."""
     return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"

@@ -25,6 +25,7 @@ from minisplat_ref.reports.page import (
     cards,
     code,
     curves,
+    link,
     page,
     panel,
     paragraph,
@@ -33,6 +34,7 @@ from minisplat_ref.reports.page import (
     table,
 )
 from minisplat_ref.runs import run_folder
+from minisplat_ref.runs.next_steps import PAGE, live_view
 from minisplat_ref.runs.progress import read_log
 from minisplat_ref.runs.report_parts import ERROR_TEXT, training_curves, view_panel
 from minisplat_ref.runs.run import Outcome
@@ -142,7 +144,7 @@ def report_html(
         section("Depth", paragraph(DEPTH_TEXT), *map(_depth_panel, images)),
         section("How the training went", paragraph(CURVES_TEXT), curves(training_curves(log))),
         section("What was run", table(rows)),
-        section("What to try next", *steps),
+        section("What to try next", link("Look around the room in this browser.", PAGE), *steps),
     ]
     return page("A room, rebuilt from photographs", introduction, sections)
 
@@ -167,8 +169,10 @@ def _depth_panel(view: ViewImages) -> str:
 
 def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
     """Return sentences, each with lines to copy."""
+    live = live_view(folder)
     sfm, training = (command(*words) for words in (("sfm", "PHOTOS", "--out", "SCENE"), ("train", "SCENE")))
     return [
+        (f"{live.purpose}:", live.line),
         ("Walk around the room:", command("render", folder, "--cameras", "orbit", "--depth")),
         (
             "Train on, for a few minutes more:",

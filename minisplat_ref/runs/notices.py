@@ -11,23 +11,21 @@ from pathlib import Path
 
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.io.frames import describe_frame
+from minisplat_ref.io.images import SIDE_MIN
 from minisplat_ref.io.inventory import take_inventory
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
 from minisplat_ref.types import FILE_FRAME, Model, Scene
 
 N_SIZES = 3  # of photographs that are all named
 FEW_POINTS = 20  # sparse points that say little about a scene
-SIDE_MIN = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
 
 
-def warn_of_scene(scene: Scene, downscale: int, *, is_dense: bool = False) -> None:
+def warn_of_scene(scene: Scene, *, is_dense: bool = False) -> None:
     """Warn of what a scene lacks for a good training.
 
     Parameters
     ----------
     scene : Scene
-    downscale : int
-        The factor by which its photographs were made smaller.
     is_dense : bool
         Whether stereo adds points to the sparse ones.
     """
@@ -38,16 +36,15 @@ def warn_of_scene(scene: Scene, downscale: int, *, is_dense: bool = False) -> No
             start = f"{n} Gaussians" if n > N_NEIGHBOURS else f"{N_RANDOM_POINTS:,} random ones among the cameras"
         _warn(
             f"scene {scene.name} has {n} sparse points: training begins with {start} and has to find the surfaces by"
-            " itself; `minisplat-ref sfm PHOTOS` makes points, and a transforms.json names a file of them as"
-            " ply_file_path"
+            " itself; `minisplat-ref sfm PHOTOS --out SCENE` makes points, and a transforms.json names a file of them"
+            " as ply_file_path"
         )
     sizes = [(view.camera.width, view.camera.height) for view in scene.train_views]
     width, height = min(sizes, key=min)
     if min(width, height) < SIDE_MIN:
-        cause = f" after --downscale {downscale}: give a smaller number" if downscale > 1 else ": give larger ones"
         _warn(
-            f"photographs of scene {scene.name} are {width} x {height} pixels{cause}; from fewer than {SIDE_MIN} x"
-            f" {SIDE_MIN} hardly any structure can be learned, and measures of them say little"
+            f"photographs of scene {scene.name} are {width} x {height} pixels: give larger ones; from fewer than"
+            f" {SIDE_MIN} x {SIDE_MIN} hardly any structure can be learned, and measures of them say little"
         )
 
 

@@ -17,6 +17,7 @@ from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.decisions_report import decisions_section
 from minisplat_ref.runs.events import count_published_times, read_mechanisms
 from minisplat_ref.runs.fired import Fired
+from minisplat_ref.runs.next_steps import ways_to_look
 from minisplat_ref.runs.progress import read_log
 from minisplat_ref.runs.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
 from minisplat_ref.runs.settings import Settings, load
@@ -81,7 +82,7 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
         sections.append(_fired(folder, settings, n_iterations))
     sections += [
         section("What was run", table(_settings(folder, settings, metrics, scene))),
-        section("What to do with it", *_next_steps(folder)),
+        section("What to do with it", *_next_steps(folder, settings)),
     ]
     return page(f"{scene.name}, trained", introduction, sections)
 
@@ -186,8 +187,10 @@ def _settings(folder: Path, settings: Settings, metrics: dict[str, Any], scene: 
     ]
 
 
-def _next_steps(folder: Path) -> list[str]:
+def _next_steps(folder: Path, settings: Settings) -> list[str]:
+    population = find_recipe(settings.recipe, extension=settings.extension).representation.population
     steps = [
+        *((f"{step.purpose}:", step.line) for step in ways_to_look(folder, population._fields)),
         ("Walk around the scene:", command("render", folder, "--cameras", "orbit")),
         ("Measure it again, or with LPIPS:", command("eval", folder)),
         ("Make it smaller, if that costs at most 0.1 dB:", _simplify(folder)),

@@ -26,6 +26,7 @@ from minisplat_ref.io.frames import (
     return_fields,
     return_population,
 )
+from minisplat_ref.io.images import check_downscale
 from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
@@ -302,6 +303,8 @@ def load_photographs(settings: Settings, frame: Frame | None = None, listing: Li
     part = None if settings.block is None else read_part(Path(settings.block), Path(settings.scene))
     if listing is None:
         listing = list_photographs(settings) if part is None else part.listing
+    cameras = [photo.camera for photo in (*listing.train_photos, *listing.test_photos)]
+    check_downscale(settings.scene, ((camera.width, camera.height) for camera in cameras), settings.downscale)
     reading = build_reading(
         settings.downscale,
         settings.background,

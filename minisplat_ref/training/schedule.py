@@ -27,6 +27,8 @@ Action = Callable[..., str | None]
 
 START = "starts_densely"
 """The setting of :attr:`Recipe.starts_densely`."""
+DSSIM = "dssim_weight"
+"""The setting of :func:`minisplat_ref.training.losses.photometric`, a share."""
 
 BLEND_STATS = frozenset({"stats"})
 """For ``During.wants``: the action finds blend statistics in ``iteration.output.stats``."""
@@ -368,7 +370,13 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
             f"recipe {recipe.name} has no {', '.join(unknown)} to set: choose from {', '.join(sorted(known))}"
         )
     weights = {term.name for term in recipe.losses}
-    return {name: _parse(name, text, known[name], name not in weights) for name, text in texts.items()}
+    values = {name: _parse(name, text, known[name], name not in weights) for name, text in texts.items()}
+    for name in sorted(weights & values.keys()):
+        if not 0 <= values[name] < math.inf:
+            raise InputError(f"--set {name}={texts[name]}: a weight of the loss is at least 0; 0 leaves the term out")
+    if DSSIM in values and not 0 <= values[DSSIM] <= 1:
+        raise InputError(f"--set {DSSIM}={texts[DSSIM]}: the shares of L1 and D-SSIM are at least 0; give 0 to 1")
+    return values
 
 
 def configure_by_name(find: Callable[[str], Recipe], text: str) -> Recipe:

@@ -354,10 +354,11 @@ def test_demo_does_not_touch_another(demo_folder, monkeypatch, capsys):
 
 def test_demo_writes_a_self_contained_report(demo_folder):
     folder = demo_folder
-    assert {path.name for path in folder.iterdir()} == RUN_FILES | {"scene"}
+    assert {path.name for path in folder.iterdir()} == RUN_FILES | {"scene", "scene.html"}
     page = (folder / "report.html").read_text()
     links = re.findall(r'(?:src|href)="([^"]*)"', page)
-    assert all(link.startswith(("data:image/png;base64,", "#")) for link in links)
+    (scene,) = [link for link in links if not link.startswith(("data:image/png;base64,", "#"))]
+    assert scene == "scene.html", "beside the report, which needs nothing else"
     assert not re.search(r"url\((?!#)|@import|<script src|<link", page)
     assert page.count("data:image/png") == 3 * 2 * N_TEST and page.count("<svg") == 3
     assert f"{read_json(folder / 'metrics.json')['psnr']:.2f} dB" in page

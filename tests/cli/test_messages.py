@@ -1,5 +1,6 @@
 """What a person is told of input that is odd but not broken: one line that says what it means for the run."""
 
+import re
 import shlex
 import shutil
 import struct
@@ -110,7 +111,7 @@ def test_raw_photographs_are_named(tmp_path, capsys):
     message = r"but 3 photographs of formats that are not read \(b\.CR2, c\.dng, d/e\.nef\): convert them to JPEG"
     with pytest.raises(InputError, match=message):
         list_images(tmp_path / "photos")
-    write_image(tmp_path / "photos" / "a.jpg", colored_image(1))
+    write_image(tmp_path / "photos" / "a.jpg", colored_image(1, 40, 32))
     with pytest.warns(InputWarning, match=r"leaving out 3 photographs of formats .* \(b\.CR2, c\.dng, d/e\.nef\): "):
         assert list_images(tmp_path / "photos") == [tmp_path / "photos" / "a.jpg"]
     assert main(["downscale", str(tmp_path / "photos")]) == 0
@@ -155,34 +156,47 @@ def test_other_warnings_keep_their_form(tmp_path, capsys, monkeypatch):
 def test_scene_without_points(tmp_path, recwarn):
     scene = load_scene(write_transforms(tmp_path, fl_x=40.0))
     with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with 100,000 random ones .* ply_file"):
-        warn_of_scene(scene, 1)
+        warn_of_scene(scene)
     with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with those that stereo finds"):
-        warn_of_scene(scene, 1, is_dense=True)
+        warn_of_scene(scene, is_dense=True)
     points = np.random.default_rng(0).normal(size=(20, 3))
     with pytest.warns(InputWarning, match=r"has 4 sparse points: training begins with 4 Gaussians and has to find"):
-        warn_of_scene(scene._replace(points=points[:4]), 1)
+        warn_of_scene(scene._replace(points=points[:4]))
     recwarn.clear()
-    warn_of_scene(scene._replace(points=points), 1)
+    warn_of_scene(scene._replace(points=points))
     assert not recwarn.list
 
 
 def test_photographs_of_a_few_pixels(tmp_path):
     scene = load_scene(write_colmap(tmp_path), downscale=1000)
     scene = scene._replace(points=np.zeros((20, 3)))
-    with pytest.warns(InputWarning, match="are 1 x 1 pixels after --downscale 1000: give a smaller number; from fewer"):
-        warn_of_scene(scene, 1000)
     with pytest.warns(InputWarning, match="are 1 x 1 pixels: give larger ones; from fewer than 16 x 16 hardly any"):
-        warn_of_scene(scene, 1)
+        warn_of_scene(scene)
 
 
 def test_training_says_so(tmp_path, capsys, monkeypatch):
     scene = write_transforms(tmp_path / "scene", fl_x=40.0)
     monkeypatch.setattr(train, "_train", lambda *_: 0)
-    options = ["--recipe", "3dgs-accel", "--downscale", "4", "--out", str(tmp_path / "out"), "--backend", "reference"]
+    options = ["--recipe", "3dgs-accel", "--out", str(tmp_path / "out"), "--backend", "reference"]
     assert main(["train", str(scene), *options]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert all(line.startswith("minisplat-ref: warning: ") for line in lines)
-    assert "sparse points" in lines[0] and "8 x 6 pixels after --downscale 4" in lines[1]
+    assert "sparse points" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        (["--downscale", "4"], "--downscale 4 leaves 8 x 6 pixels of a photograph, .*: give at most 1$"),
+        (["--downscale", "1000"], "--downscale 1000 leaves 1 x 1 pixels of a photograph"),
+        (["--set", "photometric=-1"], "--set photometric=-1: a weight of the loss is at least 0"),
+    ],
+)
+def test_training_refuses(options, cause, tmp_path, capsys):
+    scene = write_transforms(tmp_path / "scene", fl_x=40.0)
+    assert main(["train", str(scene), *options, "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(cause, line) and not (tmp_path / "out").exists()
 
 
 # Gaussians

@@ -41,11 +41,14 @@ def test_from_photographs_to_a_film(tmp_path, capsys):
     out = tmp_path / "out"
     assert photos(out, "--minutes", "0.1", "--downscale", "4") == 0
     printed = capsys.readouterr().out
-    assert steps_of(printed) == ["sfm", "train", "render"]
+    assert steps_of(printed) == ["sfm", "train", "convert", "render"]
     assert ": 9 of 9 photographs (100%)" in printed and f" of {WIDTH // 4} x {HEIGHT // 4}," in printed
     assert all((out / name).exists() for name in ("scene/sparse/0", "run/report.html", "run/metrics.json", "film.gif"))
-    assert printed.splitlines()[-2] == f"open {out / 'run' / 'report.html'}"
-    assert printed.splitlines()[-1].startswith("smaller: ") and "simplify" in printed.splitlines()[-1]
+    page, report, live, smaller = printed.splitlines()[-4:]
+    assert page == f"the scene, in any browser: open {out / 'scene.html'}" and (out / "scene.html").exists()
+    assert report.endswith(f": open {out / 'run' / 'report.html'}")
+    assert live.endswith(f" view {out / 'run'}") and "pip install 'minisplat_ref[viewer]'" in live
+    assert smaller.startswith("make it smaller: ") and " simplify " in smaller
 
 
 def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):
@@ -55,7 +58,7 @@ def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):
         assert photos(out, "--minutes", "0.1") == 130
     assert steps_of(capsys.readouterr().out) == ["train"]
     assert photos(out) == 0
-    assert steps_of(capsys.readouterr().out) == ["train", "render"]
+    assert steps_of(capsys.readouterr().out) == ["train", "convert", "render"]
     (out / "film.gif").unlink()
     assert photos(out) == 0
     assert steps_of(capsys.readouterr().out) == ["render"]
@@ -75,7 +78,7 @@ def test_results_are_named_after_the_folder_or_the_video(name, folder, tmp_path,
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).write_bytes(b"") if name.endswith(".mp4") else (tmp_path / name).mkdir()
     asked = []
-    monkeypatch.setattr(photos_command, "_do", lambda *words: asked.append(words) or 1)
+    monkeypatch.setattr(photos_command, "do", lambda *words: asked.append(words) or 1)
     assert main(["photos", name, "--downscale", "1"]) == 1
     assert asked[0][:4] == ("sfm", Path(name), "--out", Path("splats") / folder / "scene")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from minisplat_ref.cli import demo, main
+from minisplat_ref.cli import _parser_of, demo, main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from run_commands import interrupt_at
@@ -72,6 +72,9 @@ def run_all(commands, capsys):
         if words in done:
             continue
         capsys.readouterr()
+        if words[0] == "view":  # serves until Ctrl-C
+            assert _parser_of(words).parse_args(words).input.exists()
+            continue
         assert main(words) == 0, f"minisplat-ref {' '.join(words)}: {capsys.readouterr().err}"
         done.append(words)
         said = capsys.readouterr()
@@ -92,6 +95,8 @@ def test_the_chain_of_the_readme_and_what_its_reports_recommend(capsys):
     for page in sorted(pages):
         commands = recommended_in(page)
         assert {"render", "convert"} <= {words[0] for words in commands}
+        if page.parts[1] == "mine":
+            assert [words[0] for words in commands][:2] == ["convert", "view"], "how to look at it comes first"
         run_all(commands, capsys)
     assert (Path("runs/mine-small") / "point_cloud.ply").exists(), "which the run's report recommends"
     assert Path("runs/mine.spz").exists() and Path("runs/small.spz").exists()
@@ -102,6 +107,8 @@ def test_what_the_demo_recommends(capsys, monkeypatch):
     monkeypatch.setattr(demo, "SCENE", {**demo.SCENE, "width": 32, "height": 24, "n_points": 60, "n_views": 6})
     run_all([["demo", "--iterations", "5"]], capsys)
     (page,) = Path().rglob("report.html")
+    looking = page.read_text(encoding="utf-8").partition("What to try next")[2]
+    assert looking.index('href="scene.html"') < looking.index("<pre") and page.with_name("scene.html").exists()
     commands = recommended_in(page)
     own = [words for words in commands if "PHOTOS" in words or "SCENE" in words]
     assert own == [["sfm", "PHOTOS", "--out", "SCENE"], ["train", "SCENE"]], "on one's own photographs"

@@ -37,15 +37,16 @@ def assert_same_views(scene, other, check_images):
 
 
 def test_downscale(tmp_path, rng, capsys):
-    write_colmap(tmp_path, names=["a/0.png", "a/1.png", "2.jpg", "3.png"])
-    images = {name: rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8) for name in ("a/0.png", "3.png")}
+    size = 97, 83
+    write_colmap(tmp_path, names=["a/0.png", "a/1.png", "2.jpg", "3.png"], camera_size=size)
+    images = {name: rng.integers(0, 256, (*size[::-1], 4), dtype=np.uint8) for name in ("a/0.png", "3.png")}
     for name, image in images.items():
         write_image(tmp_path / "images" / name, image)
     on_the_fly = load_scene(tmp_path, downscale=5)
     assert main(["downscale", str(tmp_path), "--downscale", "5"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'images_5'}\n"
     for name, image in images.items():
-        np.testing.assert_array_equal(read_image(tmp_path / "images_5" / name), resize_image(image, 6, 5))
+        np.testing.assert_array_equal(read_image(tmp_path / "images_5" / name), resize_image(image, 19, 17))
     ready_made = load_scene(tmp_path, downscale=5)
     for a, b in zip(on_the_fly.train_views, ready_made.train_views, strict=True):
         assert a.camera[2:8] == b.camera[2:8] and a.image.shape == b.image.shape
@@ -53,9 +54,9 @@ def test_downscale(tmp_path, rng, capsys):
 
 def test_downscale_of_a_folder_of_images(tmp_path):
     (tmp_path / "train").mkdir()
-    write_image(tmp_path / "train" / "a.png", colored_image(1))
+    write_image(tmp_path / "train" / "a.png", colored_image(1, 40, 32))
     assert main(["downscale", str(tmp_path / "train")]) == 0
-    np.testing.assert_array_equal(read_image(tmp_path / "train_2" / "a.png"), colored_image(1, 16, 12))
+    np.testing.assert_array_equal(read_image(tmp_path / "train_2" / "a.png"), colored_image(1, 20, 16))
 
 
 @pytest.mark.parametrize(
@@ -69,6 +70,8 @@ def test_downscale_of_a_folder_of_images(tmp_path):
             "images_3: already there and not empty; choose another name or remove it first",
         ),
         (["broken"], "b.png: not an image that Pillow can read"),
+        (["large"], "--downscale 2 leaves 40 x 15 pixels of a photograph, and hardly any structure"),
+        (["large", "--downscale", "1000"], "fewer than 16 x 16: give at most 1"),
     ],
 )
 def test_downscale_refuses(tmp_path, capsys, arguments, message):
@@ -76,6 +79,8 @@ def test_downscale_refuses(tmp_path, capsys, arguments, message):
     shutil.copytree(tmp_path / "scene" / "images", tmp_path / "scene" / "images_3")
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
+    (tmp_path / "large").mkdir()
+    write_image(tmp_path / "large" / "a.png", colored_image(1, 80, 30))
     write_image(tmp_path / "broken" / "a.png", colored_image(1))
     (tmp_path / "broken" / "b.png").write_text("no image")
     before = sorted(tmp_path.rglob("*"))

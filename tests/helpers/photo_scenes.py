@@ -16,20 +16,22 @@ def colored_image(index, width=WIDTH, height=HEIGHT):
     return np.full((height, width, 3), (10 * index, 20 * index, 255 - 10 * index), np.uint8)
 
 
-def write_colmap(folder, *, n=4, model="PINHOLE", params=PINHOLE, names=None, image_size=(WIDTH, HEIGHT)):
+def write_colmap(
+    folder, *, n=4, model="PINHOLE", params=PINHOLE, names=None, image_size=None, camera_size=(WIDTH, HEIGHT)
+):
     """A COLMAP text model with n cameras on the x axis, looking along +z, and three points."""
     names = names or [f"{i:04d}.png" for i in range(n)]
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     numbers = " ".join(map(repr, params))
-    (sparse / "cameras.txt").write_text(f"# comment\n1 {model} {WIDTH} {HEIGHT} {numbers}\n")
+    (sparse / "cameras.txt").write_text(f"# comment\n1 {model} {camera_size[0]} {camera_size[1]} {numbers}\n")
     poses = [f"{i + 1} 1 0 0 0 {-float(i)} 0 0 1 {name}\n\n" for i, name in enumerate(names)]
     (sparse / "images.txt").write_text("".join(reversed(poses)))  # not in the order of their names
     points = ["7 0 0 5 255 0 0 0.5", "3 1 0 5 0 255 0 0.5", "9 0 1 5 0 0 255 0.5"]
     (sparse / "points3D.txt").write_text("".join(f"{point}\n" for point in points))
     for i, name in enumerate(names):
         (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-        write_image(folder / "images" / name, colored_image(i, *image_size))
+        write_image(folder / "images" / name, colored_image(i, *(image_size or camera_size)))
     return folder
 
 
