@@ -90,3 +90,7 @@ def main() -> None:
         measure_rate(arguments.scene, arguments.gaussians, arguments.iterations)
     else:
         measure_scenes(arguments.scene, arguments.out, arguments.recipe, arguments.iterations, arguments.lpips_weights)
+
+
+if __name__ == "__main__":
+    main()

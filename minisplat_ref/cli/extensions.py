@@ -1,8 +1,12 @@
 """``extensions``: which relatives of 3DGS there are, and what each brings."""
 
 import argparse
+from typing import TYPE_CHECKING
 
 from minisplat_ref.arguments import Commands, HelpFormatter
+
+if TYPE_CHECKING:
+    from minisplat_ref.extensions.extension import Extension
 
 DESCRIPTION = """\
 List the extensions, or say what one of them brings.
@@ -60,7 +64,7 @@ def _describe(name: str) -> None:
         "recipes": ", ".join(recipe.name for recipe in extension.recipes),
         "trains": extension.representation.name,
         "losses": ", ".join(term.name for term in extension.losses),
-        "commands": ", ".join(f"minisplat-ref {name} {_command_name(module)}" for module in extension.commands),
+        "commands": ", ".join(f"minisplat-ref {name} {command}" for command in _commands_of(extension)),
         "formats": ", ".join(f"{format_.suffix} ({format_.summary})" for format_ in extension.formats),
         "studies": ", ".join(f"{name}/{study.name}" for study in extension.studies),
     }
@@ -70,5 +74,9 @@ def _describe(name: str) -> None:
             print(f"{label:<8}  {value}")
 
 
-def _command_name(module: object) -> str:
-    return getattr(module, "__name__", "").rpartition(".")[2]
+def _commands_of(extension: "Extension") -> list[str]:
+    """Return the names of an extension's commands, which are not always those of their modules."""
+    commands = argparse.ArgumentParser().add_subparsers()
+    for module in extension.commands:
+        module.add_parser(commands)
+    return list(commands.choices)

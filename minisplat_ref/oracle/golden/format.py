@@ -271,8 +271,8 @@ renderer in any language can be tested, stage by stage, without our code.
 
 Write only what your program can give, into .npz files of any name in `mine/SCENE/`, by the names below; float32 or
 float64. What is missing is reported as not given. To find the stage that is wrong, feed every stage with the arrays of
-*this* folder (the table of stages says which), not with your own results of the stage before. `compare mine --against
-golden` compares with this very folder instead of recomputing the reference.
+*this* folder (the table of stages says which), not with your own results of the stage before.
+`oracle compare mine --against golden` compares with this very folder instead of recomputing the reference.
 
 ## How to read it
 
