@@ -8,10 +8,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.label import NO_LABEL, Label, read_sidecar, write_sidecar
 from minisplat_ref.types import Gaussians
+
+# The frame of glTF is LUF (x left, y up, z forward), that of a scene RDF: a rotation by 180 degrees about z.
+GLTF_AXES = np.array([-1, -1, 1], np.float32)
 
 
 class Format(NamedTuple):

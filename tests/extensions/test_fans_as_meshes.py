@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
+from gltf import glb_parts, only_primitive, values
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import SH_C0
@@ -31,6 +32,8 @@ from minisplat_ref.extensions.fans.shapes import (
 from minisplat_ref.extensions.fans.stages import stages
 from minisplat_ref.extensions.fans.tuning import alpha_of, best_shape, render_clipped
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.reference.covariance import covariances
@@ -39,7 +42,15 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Model, view_from
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT64, PRINTED_DIGITS, PROFILE_GRID
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT64,
+    PRINTED_DIGITS,
+    PROFILE_GRID,
+    ROUNDED_TO_FLOAT32,
+)
 
 FLAT, SOLID = FanShape(8, 2.5, 0.2), FanShape(8, 2.3, 0.1, is_flat=False)
 
@@ -328,15 +339,39 @@ def test_trimesh_opens_what_is_exported(suffix, model, tmp_path, capsys):
         as_dtype(make_gaussians(np.random.default_rng(3), 40), np.float32), FanShape(8, 3.0, 0.2, False)
     )
     mesh = mesh_of(fans)
-    assert_allclose(opened.vertices[opened.faces], mesh.vertices[mesh.faces], atol=1e-6)
+    turned = mesh.vertices * ([-1, -1, 1] if suffix == "glb" else 1)
+    assert_allclose(opened.vertices[opened.faces], turned[mesh.faces], atol=1e-6)
     if suffix == "glb":
         assert opened.visual.material.alphaMode == "BLEND" and opened.visual.material.doubleSided
-        rgba = opened.visual.vertex_attributes["color"]
+        rgba = 255 * np.asarray(opened.visual.vertex_attributes["color"])
+        rgba[:, :3] = 255 * tone(rgba[:, :3] / 255)
     else:
         rgba = opened.visual.vertex_colors
     n_channels = 3 if suffix == "obj" else 4
     expected = np.rint(255 * mesh.rgba[mesh.faces][..., :n_channels])
     assert_allclose(np.asarray(rgba)[opened.faces][..., :n_channels], expected, atol=1)
+
+
+def test_gltf_has_linear_colours_and_opacities_as_they_are(tmp_path):
+    """Of an opacity of 0.5, 0.5; of the colour 0.5, 0.2140. It blends, is seen from both sides, and is not lit."""
+    pytest.importorskip("trimesh")
+    rgba = np.array([[0.5, 0.04, 1.0, 0.5], [0.0, 0.5, 0.5, 0.04], [1.0, 1.0, 0.0, 1.0]])
+    mesh = TranslucentMesh(np.array([[1.0, 2, 3], [2, 2, 3], [1, 3, 4]]), rgba, np.array([[0, 1, 2]]))
+    write_mesh(tmp_path / "mesh.glb", mesh)
+    document, body = glb_parts((tmp_path / "mesh.glb").read_bytes())
+    primitive, material = only_primitive(document)
+    positions, colors = (values(document, body, primitive["attributes"][name]) for name in ("POSITION", "COLOR_0"))
+    assert_array_equal(positions, [[-1, -2, 3], [-2, -2, 3], [-1, -3, 4]])
+    half, dark = 0.21404114, 0.04 / 12.92
+    by_hand = [[half, dark, 1, 0.5], [0, half, half, 0.04], [1, 1, 0, 1]]
+    assert_allclose(colors, by_hand, rtol=ROUNDED_TO_FLOAT32)
+    assert material == {
+        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+        "extensions": {"KHR_materials_unlit": {}},
+        "alphaMode": "BLEND",
+        "doubleSided": True,
+    }
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"] and "extensionsRequired" not in document
 
 
 def test_without_trimesh_a_line_says_how_to_get_it(model, tmp_path, capsys, monkeypatch):

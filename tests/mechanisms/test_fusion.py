@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gltf import glb_parts, only_primitive, values
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.fusion import kernels, reference, volume
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest
 from minisplat_ref.mechanisms.fusion.volume import Contraction, DepthMap, Grid, Volume, empty_volume
-from minisplat_ref.mechanisms.meshes.files import check_suffix, write_mesh
+from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.mechanisms.meshes.files import check_suffix, to_glb, write_mesh
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
 from minisplat_ref.types import Camera
 from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32
@@ -232,11 +234,73 @@ def test_other_programs_open_it(suffix, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path = tmp_path / f"mesh{suffix}"
     write_mesh(path, TETRAHEDRON)
-    opened = trimesh.load(path, force="mesh", process=False)
+    (opened,) = trimesh.load_scene(path, process=False).geometry.values()
     assert opened.is_watertight and opened.volume == pytest.approx(1 / 6)
-    order = [int(np.argmin(np.abs(opened.vertices - v).sum(axis=1))) for v in TETRAHEDRON.vertices]
-    colors = np.asarray(opened.visual.vertex_colors)[order, :3]
-    assert_allclose(colors, np.rint(255 * TETRAHEDRON.colors), atol=1)
+    is_glb = suffix.lower() == ".glb"
+    expected = TETRAHEDRON.vertices * ([-1, -1, 1] if is_glb else 1)
+    order = [int(np.argmin(np.abs(opened.vertices - v).sum(axis=1))) for v in expected]
+    assert_allclose(opened.vertices[order], expected, atol=ROUNDED_TO_FLOAT32)
+    if is_glb:
+        colors = 255 * tone(np.asarray(opened.visual.vertex_attributes["color"], float))
+    else:
+        colors = np.asarray(opened.visual.vertex_colors)[:, :3]
+    assert_allclose(colors[order], np.rint(255 * TETRAHEDRON.colors), atol=1)
+
+
+def read_glb(mesh):
+    """Return the JSON of a mesh's file, its positions, colours and faces."""
+    pytest.importorskip("trimesh")
+    document, body = glb_parts(to_glb(mesh.vertices, mesh.colors, mesh.faces))
+    primitive, _ = only_primitive(document)
+    names = primitive["attributes"]
+    assert set(names) == {"POSITION", "COLOR_0"} and primitive.get("mode", 4) == 4  # triangles
+    positions, colors = (values(document, body, names[name]) for name in ("POSITION", "COLOR_0"))
+    return document, positions, colors, values(document, body, primitive["indices"]).reshape(-1, 3)
+
+
+def test_colours_of_gltf_are_linear_by_hand():
+    """Of 0.5, ((0.5 + 0.055) / 1.055)^2.4 = 0.2140; of 0.04, on the line, 0.04 / 12.92; beyond the ends, the ends."""
+    encoded = np.array([[0.5, 0.04, 0.0], [1.0, 0.5, 0.04], [-0.5, 1.5, 1.0], [0.0, 0.0, 0.0]])
+    _, _, colors, _ = read_glb(TETRAHEDRON._replace(colors=encoded))
+    half, dark = 0.21404114, 0.04 / 12.92
+    assert colors.dtype == np.float32  # a byte would be 1 of 255, not 0.79
+    assert_allclose(colors, [[half, dark, 0], [1, half, dark], [0, 1, 1], [0, 0, 0]], rtol=ROUNDED_TO_FLOAT32)
+
+
+def test_colours_of_gltf_keep_every_level():
+    levels = np.arange(256)
+    many = ColoredMesh(np.eye(256, 3), TETRAHEDRON.faces, np.repeat(levels[:, None] / 255, 3, axis=1))
+    _, _, colors, _ = read_glb(many)
+    assert_allclose(255 * tone(colors.astype(float)), np.repeat(levels[:, None], 3, axis=1), atol=1e-4)
+
+
+def test_the_material_of_gltf_is_matt_and_not_lit():
+    """Without these, glTF's defaults are those of a metal, which is dark where nothing is to be mirrored."""
+    document, *_ = read_glb(TETRAHEDRON)
+    _, material = only_primitive(document)
+    assert material["pbrMetallicRoughness"] == {"metallicFactor": 0, "roughnessFactor": 1}
+    assert material["extensions"] == {"KHR_materials_unlit": {}}
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"] and "extensionsRequired" not in document
+    assert material.get("alphaMode", "OPAQUE") == "OPAQUE" and not material.get("doubleSided", False)
+
+
+def test_the_axes_of_gltf():
+    """X and y change sign, a rotation: triangles are still seen from outside, and the volume is positive."""
+    moved = TETRAHEDRON._replace(vertices=TETRAHEDRON.vertices + np.array([2.0, 3.0, 5.0]))
+    document, positions, _, faces = read_glb(moved)
+    assert_array_equal(positions, moved.vertices * [-1, -1, 1])
+    assert_array_equal(positions[0], [-2, -3, 5])
+    assert_array_equal(faces, moved.faces)
+    p0, p1, p2 = np.moveaxis(positions[faces].astype(float), 1, 0)
+    assert np.sum(np.cross(p0, p1) * p2) / 6 == pytest.approx(1 / 6)
+    assert not {"matrix", "rotation", "scale", "translation"} & set(document["nodes"][0])
+
+
+def test_gltf_of_no_triangles_is_a_file():
+    """It has no meshes, as accessors of glTF have at least one element."""
+    pytest.importorskip("trimesh")
+    document, body = glb_parts(to_glb(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3), int)))
+    assert not document.get("meshes") and body == b""
 
 
 def test_a_ply_far_from_the_origin_keeps_its_place(tmp_path):

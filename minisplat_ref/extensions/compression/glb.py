@@ -40,7 +40,7 @@ from minisplat_ref.extensions.compression.levels8 import (
     refuse_size,
     scales_of,
 )
-from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats import GLTF_AXES, Format
 from minisplat_ref.types import Floats, Gaussians
 
 NAME = "KHR_gaussian_splatting"
@@ -53,7 +53,6 @@ ARRAY_BUFFER, POINTS = 34962, 0
 JSON_MAX = 1 << 20  # bytes
 OPACITY_END = 1e-6  # opacities 0 and 1 have no logit, and are read as so far from the end
 SCALE_MIN = 1e-10  # world units, as which a scale of 0, which the extension allows, is read
-_AXES = np.array([-1, -1, 1], np.float32)
 # Under (x, y, z) -> (-x, -y, z), by whether the polynomials are odd in x and y together; the order is that of SPZ's.
 SIGNS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
 
@@ -80,7 +79,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     n_rest = gaussians.sh_rest.shape[1]
     rest = gaussians.sh_rest * SIGNS[:n_rest, None]
     arrays = {
-        "POSITION": (gaussians.means * _AXES).astype("<f4"),
+        "POSITION": (gaussians.means * GLTF_AXES).astype("<f4"),
         "COLOR_0": colors,
         f"{NAME}:ROTATION": np.roll(quats, -1, axis=1).astype("<f4") * np.array([-1, -1, 1, 1], "<f4"),
         f"{NAME}:SCALE": scales,
@@ -155,7 +154,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     with np.errstate(invalid="ignore"):
         sh_rest = np.stack(rest, axis=1) * SIGNS[: len(rest), None] if rest else np.zeros((n, 0, 3))
     gaussians = Gaussians(
-        means=means * _AXES,
+        means=means * GLTF_AXES,
         quats=np.roll(quats * np.array([-1, -1, 1, 1]), 1, axis=1),
         log_scales=np.log(np.maximum(scales, SCALE_MIN)),
         opacity_logits=np.log(within / (1.0 - within)),

@@ -1,10 +1,11 @@
 """Fans as files: meshes for other programs, and the population's own PLY, which is such a mesh, too.
 
-A mesh file has a colour of four bytes at each vertex, red, green, blue and opacity, in the world frame of the model.
+A mesh file has a colour at each vertex, red, green, blue and opacity.
 
-- ``.ply``: written here.
-- ``.glb``, glTF in one file: by trimesh, with a material that blends and has two sides.
-- ``.obj``: by trimesh. The format has no opacity at a vertex, so that all triangles are opaque.
+- ``.ply``: four bytes, in the world frame of the model.
+- ``.glb``, glTF in one file: floats, in the frame and the colours of glTF, and a material that blends, is not lit and
+  has two sides (:func:`minisplat_ref.mechanisms.meshes.files.to_glb`).
+- ``.obj``: the world frame. The format has no opacity at a vertex, so that all triangles are opaque.
 
 The population's PLY holds every fan whole, with floats ``rgba_0`` to ``rgba_3`` besides the bytes, so that it can be
 trained further and drawn exactly. Its faces say how many sides a fan has, and whether it is flat.
@@ -18,12 +19,11 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.shapes import SOLID_PLANES, Fans, FanShape, mesh_of
-from minisplat_ref.io.formats import write_content
 from minisplat_ref.io.label import Label, to_comments
 from minisplat_ref.io.ply import COLORS, MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import property_names, read_vertices, write_vertices
-from minisplat_ref.mechanisms.meshes.files import check_suffix, trimesh_package
+from minisplat_ref.mechanisms.meshes.files import check_suffix, write_by_trimesh
 from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh, check_translucent, to_bytes
 from minisplat_ref.types import Floats
 
@@ -44,15 +44,7 @@ def write_mesh(path: Path, mesh: TranslucentMesh) -> None:
     if path.suffix.lower() == ".ply":
         write_vertices(path, _columns(mesh.vertices, to_bytes(mesh.rgba)), mesh.faces)
         return
-    trimesh = trimesh_package()
-    material = trimesh.visual.material.PBRMaterial(alphaMode="BLEND", doubleSided=True)
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=to_bytes(mesh.rgba), process=False)
-    if path.suffix.lower() == ".obj":
-        write_content(path, solid.export(file_type="obj").encode())
-        return
-    solid.visual = trimesh.visual.TextureVisuals(material=material)
-    solid.visual.vertex_attributes["color"] = to_bytes(mesh.rgba)
-    write_content(path, solid.export(file_type="glb"))
+    write_by_trimesh(path, mesh.vertices, mesh.rgba, mesh.faces, alphaMode="BLEND", doubleSided=True)
 
 
 def save_fans(path: str | Path, fans: Fans, label: Label = LABEL) -> None:

@@ -1,4 +1,8 @@
-"""Files of coloured meshes: ``.ply``, ``.obj`` and ``.glb`` (glTF in one file)."""
+"""Files of coloured meshes: ``.ply``, ``.obj`` and ``.glb`` (glTF in one file).
+
+PLY and OBJ hold a mesh as the program does: in the frame of the scene, with colours in sRGB, a byte each. glTF defines
+the axes, the colour space and the material of a mesh, to which :func:`to_glb` converts it.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -6,12 +10,16 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.formats import write_content
+from minisplat_ref.io.formats import GLTF_AXES, write_content
 from minisplat_ref.io.ply import COLORS, MEANS
 from minisplat_ref.io.ply_file import write_vertices
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
+from minisplat_ref.mechanisms.gbuffer.tone import untone
+from minisplat_ref.types import Floats, Ints
 
 SUFFIXES = (".ply", ".glb", ".obj")
+UNLIT = "KHR_materials_unlit"
+_COLOR = "_COLOR"  # trimesh writes floats only under such a name
 
 
 def check_suffix(path: Path) -> None:
@@ -57,12 +65,71 @@ def write_mesh(path: Path, mesh: ColoredMesh) -> None:
         As for :func:`check_suffix`, or the file cannot be written.
     """
     check_suffix(path)
-    colors = np.rint(255 * mesh.colors).astype(np.uint8)
     if path.suffix.lower() == ".ply":
+        colors = np.rint(255 * mesh.colors).astype(np.uint8)
         columns = dict(zip((*MEANS, *COLORS), (*mesh.vertices.T, *colors.T), strict=True))
         write_vertices(path, columns, mesh.faces)
-        return
-    opaque = np.column_stack([colors, np.full(len(colors), 255, np.uint8)])
-    solid = trimesh_package().Trimesh(mesh.vertices, mesh.faces, vertex_colors=opaque, process=False)
-    content = solid.export(file_type=path.suffix.lower()[1:])
-    write_content(path, content.encode() if isinstance(content, str) else content)
+    else:
+        write_by_trimesh(path, mesh.vertices, mesh.colors, mesh.faces)
+
+
+def write_by_trimesh(path: Path, vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> None:
+    """Write a mesh as ``.obj`` or ``.glb``, complete or not at all; the arguments are those of :func:`to_glb`.
+
+    Raises
+    ------
+    InputError
+        trimesh is not installed, or the file cannot be written.
+    """
+    if path.suffix.lower() == ".glb":
+        content = to_glb(vertices, colors, faces, **material)
+    else:
+        levels = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
+        solid = trimesh_package().Trimesh(vertices, faces, vertex_colors=levels, process=False)
+        content = solid.export(file_type="obj").encode()
+    write_content(path, content)
+
+
+def to_glb(vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> bytes:
+    """Return a mesh as glTF 2.0 in one file.
+
+    - Positions are in the frame of glTF: x and y change sign.
+    - ``COLOR_0`` is linear, by the curve of IEC 61966-2-1, and stored in float32. Bytes would keep 183 of the 256
+      levels of sRGB and make the darkest seven black. Opacity is not encoded in sRGB and stays as it is.
+    - The material is unlit (KHR_materials_unlit), because the colours contain the light of the photographs. A program
+      without this extension lights a matt surface; glTF's default material is a metal, which mirrors its surroundings.
+    - Triangles are visible from the front only, unless ``doubleSided`` says otherwise. No camera has seen the back of
+      a fused surface, and from outside a room one looks through its walls.
+
+    Parameters
+    ----------
+    vertices : ndarray of shape (P, 3)
+        World frame, world units.
+    colors : ndarray of shape (P, 3) or (P, 4)
+        sRGB, and opacity if there is one; what is outside [0, 1] is clipped.
+    faces : ndarray of shape (T, 3)
+        Rows of the vertices, counter-clockwise seen from outside.
+    **material
+        Further properties of the material, by their names in glTF, such as ``alphaMode="BLEND"``.
+
+    Raises
+    ------
+    InputError
+        trimesh is not installed.
+    """
+    shares = np.clip(colors, 0, 1)
+    linear = np.column_stack([untone(shares[:, :3]), shares[:, 3:]]).astype(np.float32)
+    matt = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+
+    def add_material(tree: dict[str, Any]) -> None:
+        tree["extensionsUsed"] = [UNLIT]
+        tree["materials"] = [matt | {"extensions": {UNLIT: {}}} | material]
+        for mesh in tree.get("meshes", []):  # none if there are no triangles
+            (primitive,) = mesh["primitives"]
+            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_COLOR)
+            primitive["material"] = 0
+
+    turned = vertices * GLTF_AXES  # a rotation: the order of a triangle's corners stays
+    solid = trimesh_package().Trimesh(turned, faces, vertex_attributes={_COLOR: linear}, process=False)
+    content: bytes = solid.export(file_type="glb", tree_postprocessor=add_material)
+    return content
