@@ -185,7 +185,7 @@ ORDER = (
     ),
     Part(
         "the application",
-        ("runs/", "comparison/", "blocks/", "studies/", "reports/", "cli/"),
+        ("runs/", "comparison/", "blocks/", "reports/", "cli/"),
         (
             Step(
                 ("cli/train.py", "runs/settings.py", "runs/run_folder.py", "runs/run.py"),
@@ -193,9 +193,9 @@ ORDER = (
                 "from a command line to a run and its folder",
             ),
             Step(
-                ("comparison/", "blocks/", "studies/", "reports/"),
+                ("comparison/", "blocks/", "reports/"),
                 (),
-                "recipes side by side; how a claim is measured; the page of a result",
+                "recipes side by side; a large scene in blocks; the page of a result",
             ),
         ),
     ),

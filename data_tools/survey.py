@@ -21,7 +21,6 @@ from argparse import SUPPRESS
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from fnmatch import fnmatch
-from functools import partial
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
@@ -32,14 +31,13 @@ from typing import NamedTuple
 import numpy as np
 
 import minisplat_ref
+from data_tools.claims.kit.records import hand_out, handing_out, one_job, resume
 from data_tools.survey_errors import ERRORS, PlantedLine
 from minisplat_ref.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
-from minisplat_ref.cli.study import hand_out
 from minisplat_ref.errors import InputError
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.runs.cluster import Workers
 from minisplat_ref.runs.worker import versions
-from minisplat_ref.studies.records import handing_out, one_job, resume
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 COMMANDS = {
@@ -208,7 +206,7 @@ def main(words: Sequence[str]) -> int:
             with one_job(args.job):
                 survey_all(errors, args.commands, folder)
             return 0
-        elsewhere = partial(hand_out, workers, without_workers(words), noun="survey", program="data_tools.survey")
+        elsewhere = hand_out(workers, without_workers(words), "data_tools.survey", "survey")
         with handing_out(elsewhere if workers.is_used else None):
             outcomes = survey_all(errors, args.commands, folder)
     print(as_markdown(outcomes))

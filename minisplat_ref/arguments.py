@@ -82,6 +82,15 @@ def integer(minimum: int) -> Callable[[str], int]:
     return parse
 
 
+def add_number(
+    parser: argparse._ActionsContainer, option: str, default: int, meaning: str, minimum: int = 1, metavar: str = "N"
+) -> None:
+    """Add an option that is a whole number of at least ``minimum``."""
+    parser.add_argument(
+        option, type=integer(minimum), default=default, metavar=metavar, help=f"{meaning} (default {default})"
+    )
+
+
 def name(text: str) -> str:
     """Type of a name, which must be there."""
     if not text:

@@ -414,12 +414,12 @@ plt.show()
 # in a run as short as this, SSIM gains a little and PSNR is lower than without it. The Gaussians that it splits are the
 # largest of all: a child that is drawn a metre away ends up somewhere in the room, the wall behind it has a hole, and
 # every event comes before the last one is repaired. The released code draws at random and has thousands of iterations
-# for the repair. The recipes of this package draw at random, too; `study ablation` has both forms.
+# for the repair. The recipes of this package draw at random, too; `claims ablation` has both forms.
 #
-# The thresholds matter too. `minisplat-ref study ablation SCENE --out DIR` trains a whole recipe in these ways: on this
-# room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other. There the
-# gradient's threshold is the published one, which asks for a split nearly everywhere in small images, and the area adds
-# hardly any.
+# The thresholds matter too. `python -m data_tools.claims ablation SCENE --out DIR` trains a whole recipe in these ways:
+# on this room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other.
+# There the gradient's threshold is the published one, which asks for a split nearly everywhere in small images, and the
+# area adds hardly any.
 #
 # ## Play
 #

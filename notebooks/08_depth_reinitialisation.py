@@ -32,6 +32,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 
+from data_tools.claims.depth import (
+    OFF_SURFACE,
+    Choice,
+    depth_errors,
+    draw_points,
+    errors,
+)
 from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -46,13 +53,6 @@ from minisplat_ref.strategy.depth_reinit import (
     reinitial_points,
 )
 from minisplat_ref.strategy.initialization import from_points
-from minisplat_ref.studies.depth_types import (
-    OFF_SURFACE,
-    Choice,
-    depth_errors,
-    draw_points,
-    errors,
-)
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
@@ -108,7 +108,7 @@ plt.show()
 # |---|---|---|
 # | `minisplat_ref/strategy/depth_reinit.py` | points of the pixels; which are drawn; safeguards | MS sec. 4.1, app. D |
 # | `minisplat_ref/strategy/simplify.py` | `sample`: drawing without replacement | |
-# | `minisplat_ref/studies/depth_types.py` | the comparison below, larger, with several seeds | MS table 4 |
+# | `data_tools/claims/depth.py` | the comparison below, larger, with several seeds | MS table 4 |
 #
 # *MS* is Mini-Splatting, Fang and Wang 2024; the safeguards are not in the paper. **Frames and units:** the world is in
 # metres, z up; camera axes are x right, y down, z forward; a depth is the camera z.
@@ -340,8 +340,8 @@ for name in ("outdoor", "plain-wall"):
 # Not by themselves. Outdoors the vote removes points that hang in the sky, but the sky still has to be painted, and
 # there is less left to paint it on: wrong points are useful. The backdrop gives something to paint on again, this time
 # behind the scene and not in the middle of it. On the plain wall the three are within a decibel. In runs as short and
-# small as these, one seed says little about a decibel or two; `minisplat-ref study depth outdoor --out DIR` trains the
-# whole recipe at 160 x 120 with three seeds. The recipes use vote and backdrop.
+# small as these, one seed says little about a decibel or two; `python -m data_tools.claims depth outdoor --out DIR`
+# trains the whole recipe at 160 x 120 with three seeds. The recipes use vote and backdrop.
 #
 # ## Play
 #

@@ -380,7 +380,7 @@ plt.show()
 # * `metric`: with `"outdoor"`, which parts of the room become sparser?
 # * `choose`: `simplify.by_sampling`, `simplify.by_rank` or `simplify.by_merging`.
 #
-# `minisplat-ref study simplify --help` draws the curves on any scene, with several seeds and after fine-tuning.
+# `python -m data_tools.claims simplify --help` draws the curves on any scene, with several seeds and after fine-tuning.
 
 # %% tags=["rounding"]
 fraction, metric, choose = 0.4, "outdoor", simplify.by_sampling

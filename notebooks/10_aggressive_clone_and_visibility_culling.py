@@ -474,7 +474,7 @@ plt.show()
 # * `mass`: with 0.9 instead of 0.99, which parts of the picture go first?
 # * `critical_rule`: the paper's `aggressive_clone.critical_by_weight` doubles very few.
 #
-# `minisplat-ref study culling SCENE --out DIR` measures fraction, time and PSNR on any scene.
+# `python -m data_tools.claims culling SCENE --out DIR` measures fraction, time and PSNR on any scene.
 
 # %% tags=["rounding"]
 factor, mass, critical_rule = 4, 0.9, aggressive_clone.critical_by_mass

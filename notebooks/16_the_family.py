@@ -20,8 +20,8 @@
 # notebook takes seven of them, one idea and one picture each: what long Gaussians cost, what a pixel sees of a thin
 # one, what to draw in a small picture, which Gaussians to keep, how to store them, and how to bend them.
 #
-# Nothing here is a benchmark. The figures of a folder's docstring are measured with `minisplat-ref study`; the pictures
-# here show why they come out as they do.
+# Nothing here is a benchmark. The figures of a folder's docstring are measured with `python -m data_tools.claims`; the
+# pictures here show why they come out as they do.
 #
 # ## Small Gaussians: the penalty of a needle
 #
@@ -34,11 +34,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from data_tools.claims.analytic import METHODS, OPACITY, REACH, approximations, covariance, truth
+from data_tools.claims.proxies.affine import RADIUS, flat_gaussians, roll
+from data_tools.claims.proxies.affine import camera as card_camera
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.analytic.footprint import METHODS, OPACITY, REACH, approximations, covariance, truth
 from minisplat_ref.extensions.antialiasing.reference import smooth
 from minisplat_ref.extensions.compression.lattice import from_lattice, to_lattice
 from minisplat_ref.extensions.compression.levels import exponents
@@ -51,8 +53,6 @@ from minisplat_ref.extensions.omg.reference import distinct_importance, local_di
 from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, roll
-from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.mechanisms.packing.container import parse
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
@@ -312,7 +312,7 @@ print(f"{n_common} of {len(importance) // 2} are kept by both scores")
 #
 # Neighbours are the ones before and after in Morton order, which sorts an octree into a line. Textured parts are bright
 # in the middle picture, walls are dark. Right after pruning the second score has the lower PSNR here. Neither half is
-# meant to be used as it is: training goes on, and `study omg/distinctiveness` measures the gain after it.
+# meant to be used as it is: training goes on, and `claims omg/distinctiveness` measures the gain after it.
 #
 # ## Storing: an error with a bound
 #

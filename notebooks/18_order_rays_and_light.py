@@ -34,12 +34,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.pixel_order.clouds import ANGLES, BARE, cloud, orders, peak_responses, projection_errors
-from minisplat_ref.extensions.pixel_order.method import ORDERED
-from minisplat_ref.extensions.rays.demo import (
+from data_tools.claims.pixel_order import ANGLES, BARE, cloud, orders, peak_responses, projection_errors
+from data_tools.claims.rays.demo import (
     BIAS,
     CENTRE,
     LAMP,
@@ -51,6 +47,10 @@ from minisplat_ref.extensions.rays.demo import (
     floor,
     world_of,
 )
+from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.rays.kernels import tree_of
 from minisplat_ref.extensions.rays.lights import shade
 from minisplat_ref.extensions.rays.method import whiten_model
@@ -480,7 +480,7 @@ plt.show()
 # keeps its $t$, so that its origin is that camera, exactly.
 #
 # ```python
-# from minisplat_ref.extensions.rays.claims import mirror_difference
+# from data_tools.claims.rays.measures import mirror_difference
 #
 # assert mirror_difference(40, seed=0) < 1e-9
 # ```

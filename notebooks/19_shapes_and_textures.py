@@ -32,30 +32,30 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import PolyCollection
 
+from data_tools.claims.analytic import OPACITY, approximations, covariance, truth
+from data_tools.claims.cuts import card
+from data_tools.claims.fans.profile import fan_profile, profile_error
+from data_tools.claims.kit import floats_of, psnr_of
+from data_tools.claims.mixed import fit
+from data_tools.claims.polygons import edits as polygon_claims
+from data_tools.claims.rays.demo import ball as ball_of_discs
+from data_tools.claims.textured import colors_across
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.analytic.footprint import OPACITY, approximations, covariance, truth
 from minisplat_ref.extensions.analytic.reference import NORMAL, integrals
-from minisplat_ref.extensions.cuts import card
 from minisplat_ref.extensions.cuts.curve import VERTICES, evaluate_cuts
 from minisplat_ref.extensions.fans.method import render as render_fans
-from minisplat_ref.extensions.fans.profile import fan_profile, profile_error
 from minisplat_ref.extensions.fans.shapes import FanShape, convert_gaussians, mesh_of
-from minisplat_ref.extensions.mixed import fit
 from minisplat_ref.extensions.mixed import response as hull_response
-from minisplat_ref.extensions.polygons import claims as polygon_claims
 from minisplat_ref.extensions.polygons.soup import soup_of
-from minisplat_ref.extensions.rays.demo import ball as ball_of_discs
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import with_textures
 from minisplat_ref.extensions.textured.reference import frames, meet
-from minisplat_ref.extensions.textured.study import colors_across
 from minisplat_ref.mechanisms.meshes.fans import fit_spans, rims
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.studies.kit import floats_of, psnr_of
 from minisplat_ref.types import Camera, Model, view_from
 
 # %% tags=["rounding"]
@@ -108,7 +108,7 @@ plt.show()
 
 # %% [markdown]
 # Paint helps, up to what eight or fifteen waves around a ball can show: they have no sharp edges. And it does not help
-# more than as many numbers that are spent on further Gaussians. Trained scenes say the same (`study textured/counts`).
+# more than as many numbers that are spent on further Gaussians. Trained scenes say the same (`claims textured/counts`).
 #
 # Where does a ray meet the paint? At the first point of the ellipsoid of one deviation. With the ray turned into the
 # Gaussian's axes and divided by its deviations, that ellipsoid is the unit sphere, and its point is a direction $n$.
@@ -436,7 +436,7 @@ plt.show()
 # $$ \operatorname{fan}(r, \theta) = 1 - \frac{r \cos\theta}{k \cos(\pi / n)} \quad \text{up to the rim,} $$
 #
 # at the distance $r$ from the centre and the angle $\theta$ from the middle of a side. A linear slope is no bell, so
-# that a scene loses something; refitting colours, opacities and vertices gives a part of it back (`study fans/refit`).
+# that a scene loses something; refitting colours, opacities and vertices gives a part of it back (`claims fans/refit`).
 #
 # ## Play
 #

@@ -29,11 +29,11 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+from data_tools.claims.lucas_kanade import trainings as motion_study
+from data_tools.claims.lucas_kanade.body import film, make_body
+from data_tools.claims.vdgs import pane as pane_study
 from figures import BLUE, GREY, RED, show, show_code
-from minisplat_ref.extensions.lucas_kanade import study as motion_study
-from minisplat_ref.extensions.lucas_kanade.body import film, make_body
 from minisplat_ref.extensions.lucas_kanade.pyramid import optical_flow
-from minisplat_ref.extensions.vdgs import study as pane_study
 from minisplat_ref.mechanisms.networks.mlp import forward, forward_vjp, make_network, train_step, zero_moments
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
 

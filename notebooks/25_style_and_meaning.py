@@ -23,15 +23,15 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+from data_tools.claims import segment as masks_study
+from data_tools.claims import style as style_study
 from figures import BLUE, GREY, RED, show, show_code
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.segment import study as masks_study
 from minisplat_ref.extensions.segment.assignment import belongs, labels
 from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.render import paint
 from minisplat_ref.extensions.segment.votes import count_votes, votes_of_view
-from minisplat_ref.extensions.style import study as style_study
 from minisplat_ref.extensions.style.reference import match_colors
 from minisplat_ref.extensions.style.styling import Plan, stylise
 from minisplat_ref.mechanisms.features.filters import CLASSICAL, EVEN, gabor_filters

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref import save_ply
-from minisplat_ref.cli import EXTRAS
+from minisplat_ref.cli.guard import EXTRAS
 from photo_scenes import write_transforms
 from scenes import as_dtype, make_gaussians
 

@@ -110,9 +110,9 @@ def _after_downscaling(folder: Path) -> None:
     scene, run = room(folder), folder / "run"
     _write(scene, NAMES[3], SPECK)
     assert not done("info", scene).warnings
-    said = done("train", scene, *OPTIONS, "--downscale", 4, "--out", run)
+    said = done("train", scene, *OPTIONS, "--downscale", 2, "--out", run)
     (warning,) = [line for line in said.warnings if "mask" in line]
-    assert f"masks/{NAMES[3]}.png.png (at 12 x 9 pixels)" in warning
+    assert f"masks/{NAMES[3]}.png.png (at 24 x 18 pixels)" in warning
     done("eval", run)
 
 

@@ -9,20 +9,15 @@ which and what to do), 130 interrupted. A programming error keeps its traceback.
 """
 
 import argparse
-import io
-import logging
-import os
 import sys
 import textwrap
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from importlib.util import find_spec
-from typing import Any, TextIO
+from collections.abc import Sequence
+from typing import Any
 
 from minisplat_ref import __version__
 from minisplat_ref.arguments import HelpFormatter, Parser
-from minisplat_ref.errors import InputError, InputWarning
+from minisplat_ref.cli.guard import check_packages, run_guarded
+from minisplat_ref.errors import InputError
 
 from . import (
     bench,
@@ -41,7 +36,6 @@ from . import (
     render,
     sfm,
     simplify,
-    study,
     synthetic,
     train,
     undistort,
@@ -52,13 +46,10 @@ GROUPS = {
     "start here": (demo, photos),
     "preparing scenes": (data, sfm, undistort, downscale, synthetic),
     "training and its results": (train, view, render, evaluate, simplify, mesh, convert, compare, info),
-    "checks and measurements": (oracle, bench, study),
+    "checks and measurements": (oracle, bench),
     "the program itself": (extensions, cache),
 }
 """The commands under the headings of ``--help``."""
-
-EXTRAS = {"matplotlib": "photos"}
-"""Packages that commands draw with, by the extra that brings them."""
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,
@@ -172,92 +163,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit code: 0, 2 for bad input, 130 when interrupted.
     """
-    argv = sys.argv[1:] if argv is None else argv
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of its caches of fonts
-    with warnings.catch_warnings(), _printing_any_name():
-        _print_warnings_in_one_line()
-        return _run(argv)
-
-
-@contextmanager
-def _printing_any_name() -> Iterator[None]:
-    """Have characters that the terminal's code page lacks printed as escapes, instead of ending the command."""
-    streams = [stream for stream in (sys.stdout, sys.stderr) if isinstance(stream, io.TextIOWrapper)]
-    strict = [stream for stream in streams if stream.errors in ("strict", "surrogateescape")]
-    before = [str(stream.errors) for stream in strict]
-    for stream in strict:
-        stream.reconfigure(errors="backslashreplace")
-    try:
-        yield
-    finally:
-        for stream, errors in zip(strict, before, strict=True):
-            if not stream.closed:
-                stream.reconfigure(errors=errors)
-
-
-def _print_warnings_in_one_line() -> None:
-    """Have warnings about the input printed like errors, without the line of our source that gave them.
-
-    What NumPy says of an overflow, and matplotlib of a letter that its font lacks, helps no user and is left out.
-    """
-    show = warnings.showwarning
-
-    def show_input_warning(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        if issubclass(category, InputWarning):
-            print(f"minisplat-ref: warning: {message}", file=sys.stderr)
-        elif not (issubclass(category, RuntimeWarning) or str(message).startswith("Glyph ")):
-            show(message, category, filename, lineno, file, line)
-
-    warnings.simplefilter("always", InputWarning)
-    warnings.showwarning = show_input_warning
-
-
-def _check_packages(needed: Sequence[str]) -> None:
-    """Refuse a command before it begins whose end would need a package that is not there."""
-    for package in needed:
-        if find_spec(package) is None:
-            raise InputError(_missing(package))
-
-
-def _missing(package: str) -> str:
-    return f"this needs {package}, which is not installed: pip install 'minisplat_ref[{EXTRAS[package]}]'"
+    words = sys.argv[1:] if argv is None else argv
+    return run_guarded(lambda: _run(words))
 
 
 def _run(argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
-    try:
-        parser = _parser_of(argv)
-        args = parser.parse_args(argv)
-        args.words = tuple(argv)
-        if args.run is None:
-            parser.print_help()
-            return 0
-        _check_packages(getattr(args, "needs", ()))
-        code: int = args.run(args)
-        sys.stdout.flush()
-    except InputError as error:
-        print(f"minisplat-ref: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in EXTRAS:
-            raise
-        print(f"minisplat-ref: error: {_missing(package)}", file=sys.stderr)
-        return 2
-    except MemoryError:
-        print("minisplat-ref: error: memory is full: give less at a time (--downscale, --size)", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("minisplat-ref: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader of the output has seen enough, like head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter fails to flush at its end
+    parser = _parser_of(argv)
+    args = parser.parse_args(argv)
+    args.words = tuple(argv)
+    if args.run is None:
+        parser.print_help()
         return 0
+    check_packages(getattr(args, "needs", ()))
+    code: int = args.run(args)
     return code

@@ -66,7 +66,6 @@ def _describe(name: str) -> None:
         "losses": ", ".join(term.name for term in extension.losses),
         "commands": ", ".join(f"minisplat-ref {name} {command}" for command in _commands_of(extension)),
         "formats": ", ".join(f"{format_.suffix} ({format_.summary})" for format_ in extension.formats),
-        "studies": ", ".join(f"{name}/{study.name}" for study in extension.studies),
     }
     print()
     for label, value in rows.items():

@@ -17,7 +17,6 @@ from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.rendering import SPLATTING
-from minisplat_ref.studies.study import Study
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import Recipe, scale_recipe
@@ -49,8 +48,6 @@ class Extension(NamedTuple):
     sample: Callable[[Gaussians, np.random.Generator], Any] | None = None
     """Makes of any Gaussians a population that exercises the renderer, for ``bench --extension NAME``; by default the
     representation's ``extend``, which may leave them as they are."""
-    studies: tuple[Study, ...] = ()
-    """Its measured claims: ``minisplat-ref study NAME/...``."""
     formats: tuple[Format, ...] = ()
     """File formats of the six fields of 3DGS, which ``convert`` writes, and every command reads that reads a PLY."""
 
@@ -97,7 +94,6 @@ _PARTS: dict[str, type] = {
     "recipes": Recipe,
     "losses": LossTerm,
     "commands": ModuleType,
-    "studies": Study,
     "formats": Format,
 }
 

@@ -19,13 +19,13 @@ Afterwards
     without, but should be told of), :mod:`.model_file` (who draws a file, and what it lacks of its run).
 
 A mesh: what ``mesh`` does
-    :mod:`.depth_maps` (what a camera shows of the surface), :mod:`.meshing` (fused and extracted), :mod:`.mesh_report`,
-    :mod:`.mesh_study` (``study mesh``: how far meshes are from the true surface).
+    :mod:`.depth_maps` (what a camera shows of the surface), :mod:`.meshing` (fused and extracted) and
+    :mod:`.mesh_report`.
 
 A smaller model: what ``simplify`` does
     :mod:`.opened_run` (what is read of the run, and its folds of views), :mod:`.rate_distortion` (drop, standard error,
-    and the search for a size by them), :mod:`.simplification` (sizes reached, fine-tuned and measured),
-    :mod:`.simplified_run` (the new folder), :mod:`.max_drop_study` (``study max-drop``: what is promised and kept).
+    and the search for a size by them), :mod:`.simplification` (sizes reached, fine-tuned and measured) and
+    :mod:`.simplified_run` (the new folder).
 
 Its reports
     :mod:`.run_report`, :mod:`.demo_report`, :mod:`.simplification_report`, of :mod:`.report_parts`, :mod:`.fired`

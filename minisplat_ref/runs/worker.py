@@ -48,6 +48,11 @@ class Job(NamedTuple):
     """The module that is run, which is there in the working folder of the commands or is installed."""
 
 
+def unless_exists(file: Path, words: Sequence[str]) -> Sequence[str] | None:
+    """Return the words of a command, None where the file that it leaves is there: a :attr:`Job.choose`."""
+    return None if file.exists() else words
+
+
 class Site(NamedTuple):
     """What all workers must find on the storage that they share."""
 

@@ -59,3 +59,8 @@ class Representation(NamedTuple):
 
 GAUSSIANS = Representation("gaussians")
 """3DGS: static Gaussians with spherical harmonics."""
+
+
+def floats_of(population: Any) -> int:
+    """Return how many floats a primitive of the population has."""
+    return sum(int(np.prod(field.shape[1:])) for field in population)

@@ -28,7 +28,6 @@ from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.reports.images import GAP, error_image, to_8_bits
 from minisplat_ref.runs.progress import LOG_EVERY, Progress, read_log
-from minisplat_ref.studies import all_studies
 from tolerances import PSNR_FLOAT32
 
 WIDTH, HEIGHT = 32, 24
@@ -392,7 +391,7 @@ def test_the_report_of_a_training_shows_it(run_folder):
 # help
 
 
-@pytest.mark.parametrize("command", ["", *commands(), *(f"study {name}" for name in all_studies())])
+@pytest.mark.parametrize("command", ["", *commands()])
 def test_help_fits_a_screen(command, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", str(HELP_COLUMNS_MAX))
     with pytest.raises(SystemExit) as exit_info:
@@ -408,12 +407,11 @@ def test_help_loads_nothing_heavy():
     code = f"""
 import sys
 from minisplat_ref.cli import main
-for command in {["", *commands(), *(f"study {name}" for name in all_studies())]!r}:
+for command in {["", *commands()]!r}:
     try:
         main([*command.split(), "--help"])
     except SystemExit:
         pass
-main(["study"])
 print("LOADED", {{"numba", "numpy", "scipy", "pycolmap", "matplotlib", "PIL", "tqdm"}} & set(sys.modules))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -3,9 +3,9 @@
 What is required of a quote depends on where it stands:
 
 - A line that is a command, in a code block, an example or a docstring, is there to be copied. It must parse.
-- Inline code, which may leave out ``minisplat-ref``, and a command within a sentence must parse, too, if they hold a
-  value or a positional argument. A command without any argument is a name, which must exist; one with nothing but
-  options (``train --view``) names these.
+- Inline code, which may leave out ``minisplat-ref`` (and ``python -m data_tools.`` before ``claims``), and a command in
+  a sentence must parse, too, if they hold a value or a positional argument. A command without any argument is a name,
+  which must exist; one with nothing but options (``train --view``) names these.
 - A quote with ``...`` is a fragment: its commands and options must exist.
 
 In all of them a word in capitals (``SCENE``, ``N``, ``AxB``, ``tcp://HOST:PORT``) stands for any value, what is in
@@ -31,16 +31,17 @@ from unittest import mock
 
 import pytest
 
+from data_tools.claims import all_claims, find_claim
+from data_tools.claims.__main__ import parser_of
 from minisplat_ref import cli
-from minisplat_ref.cli import study
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.studies import all_studies
 
 ROOT = Path(__file__).parents[2]
 RETIRED = {"mini_splatting.md": "study split room", "adaptive.md": "--candidates"}  # and the commit that still has them
 UNREADABLE = ("data_tools.commit_subject", "data_tools.mutation")  # without argparse; needs what tests do not install
+CLAIMS = ("data_tools.claims", "claims")  # inline code may leave out `python -m data_tools.`, too
 VALUE = "{}"  # what a part in braces of an f-string becomes
 
 
@@ -91,14 +92,16 @@ _ANY_WORDS.parser.add_argument("words", nargs=argparse.REMAINDER)
 @cache
 def reader_of(first: str, second: str) -> Reader:
     """Return what reads a command by its first two words; a script is run until it parses, so that is its first act."""
-    if first.startswith("data_tools."):
+    if first in CLAIMS and second[:1].islower():
+        reader = Reader(parser_of(second, find_claim(second)), n_names=2)
+    elif first in CLAIMS:
+        reader = _ANY_WORDS
+    elif first.startswith("data_tools."):
         if importlib.util.find_spec(first) is None:
             raise InputError(f"there is no {first}")
         with mock.patch.object(sys, "argv", [first]):
             run = partial(runpy.run_module, first, run_name="__main__")
             reader = _ANY_WORDS if first in UNREADABLE else _reader_in(run, n_names=1)
-    elif first == "study" and second[:1].islower():
-        reader = _reader_in(study.run, argparse.Namespace(name=second, arguments=[]), n_names=2)
     else:
         reader = Reader(cli._parser_of([first]))
     _accept_placeholders(reader.parser)
@@ -145,7 +148,7 @@ def commands_of(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentP
     return next((a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)), {})
 
 
-COMMANDS = {*commands_of(cli.build_parser()), *folders()}  # what can be the first word
+COMMANDS = {*commands_of(cli.build_parser()), *folders(), "claims"}  # what can be the first word
 
 
 # What is wrong with a quote
@@ -193,7 +196,7 @@ def _error_of(words: list[str], is_line: bool) -> str:
         if commands and rest and rest[0] != "..." and not rest[0].startswith("-"):
             return f"there is no command {rest[0]}"
         if any(action.nargs == argparse.REMAINDER for action in parser._actions):
-            return ""  # `study NAME --seeds N`: of any study
+            return ""  # `claims NAME --seeds N`: of any claim
         options = [word.partition("=")[0] for word in rest if word.startswith("--")]
         return ", ".join(f"there is no {option}" for option in options if option not in parser._option_string_actions)
     error = _parse(top, words)
@@ -302,11 +305,12 @@ def strings_of(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def in_help() -> Iterator[Quote]:
-    """Return the quotes of what ``--help`` of all commands, of all extensions' commands and studies prints."""
+    """Return the quotes of what ``--help`` of all commands, of all extensions' commands and claims prints."""
     extensions = [load_extension(name) for name in folders()]
-    studies = [*all_studies(), *(f"{each.name}/{study.name}" for each in extensions for study in each.studies)]
     firsts = ["", *(each.name for each in extensions if each.commands)]
-    parsers = [reader_of(first, "").parser for first in firsts] + [reader_of("study", name).parser for name in studies]
+    parsers = [reader_of(first, "").parser for first in firsts] + [
+        reader_of("claims", name).parser for name in all_claims()
+    ]
     for parser in parsers:  # also those that are added on the way
         parsers += commands_of(parser).values()
         for text in (parser.usage, parser.description, parser.epilog, *(action.help for action in parser._actions)):
@@ -346,10 +350,10 @@ def test_extensions_prints_commands_that_exist(name, capsys):
         ("train --view", False),
         ("train SCENE --recipe NAME [--no-such-option]", True),
         ("train --resume ... --iterations N", False),
-        ("study folds", False),
-        ("study folds fox banana --out DIR", True),
-        ("study velocity/motion --seed S", True),
-        ("study NAME --workers N", False),
+        ("claims folds", False),
+        ("claims folds fox banana --out DIR", True),
+        ("data_tools.claims velocity/motion --seed S", True),
+        ("claims NAME --workers N", False),
         ("oracle CHECK --report FILE.html", False),
         ("render RUN --map albedo|normal --workers N", True),
         ("compare SCENE --recipes A,B --out DIR --cluster tcp://HOST:PORT", True),
@@ -372,11 +376,11 @@ def test_right_quotes(text, is_line):
         ("train ... --veiw", False, "there is no --veiw"),
         ("train SCENE --blocks 2by2", False, "--blocks"),
         ("train SCENE --profile inrai", False, "invalid choice: 'INRAI'"),
-        ("study fodls", False, "there is no study 'fodls'"),
-        ("study folds", True, "required: SCENE, --out"),
-        ("study folds fox", False, "required: --out"),
-        ("study folds --seeds 0", False, "required: SCENE, --out"),
-        ("study velocity/motoin", False, "there is no study 'velocity/motoin'"),
+        ("claims fodls", False, "there is no claim 'fodls'"),
+        ("claims folds", True, "required: SCENE, --out"),
+        ("data_tools.claims folds fox", False, "required: --out"),
+        ("claims folds --seeds 0", False, "required: SCENE, --out"),
+        ("claims velocity/motoin", False, "there is no claim 'velocity/motoin'"),
         ("oracle gradient", False, "invalid choice: 'gradient'"),
         ("oracle gradient ...", False, "there is no command gradient"),
         ("oracle CHECK --raport FILE.html", False, "--raport"),
@@ -397,7 +401,7 @@ def test_wrong_quotes(text, is_line, error):
 
 def test_where_a_text_has_quotes():
     text = """\
-Run `train SCENE\n--view`, ``minisplat-ref study`` or `python -m data_tools.sfm`, not `train`, `view = 1` or `a train`.
+Run `train SCENE\n--view`, ``minisplat-ref data`` or `python -m data_tools.sfm`, not `train`, `view = 1` or `a train`.
 
 A sentence has minisplat-ref train --resume RUN as a part; minisplat-ref data NAME fetches one.
 Write it with: minisplat-ref oracle export DIR
@@ -412,5 +416,5 @@ new/bin/minisplat-ref bench && new/bin/minisplat-ref oracle truth
 """
     lines = ["bench", "oracle truth", "oracle export DIR", "info RUN", "train SCENE --view"]
     assert [quote for quote, is_line in quotes_of(text) if is_line] == lines
-    others = ["train SCENE --view", "study", "data_tools.sfm", "train --resume RUN"]
+    others = ["train SCENE --view", "data", "data_tools.sfm", "train --resume RUN"]
     assert [quote for quote, is_line in quotes_of(text) if not is_line] == others

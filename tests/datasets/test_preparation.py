@@ -190,7 +190,7 @@ def test_pycolmap_is_missing(tmp_path, capsys, monkeypatch):
 # scripts
 
 
-@pytest.mark.parametrize("name", ["sfm", "undistort", "downscale", "synthetic", "study"])
+@pytest.mark.parametrize("name", ["sfm", "undistort", "downscale", "synthetic"])
 def test_script_is_the_command(name):
     """Of a checkout that nothing has been installed from: the package is found beside the script's folder."""
     command = [sys.executable, "-m", f"data_tools.{name}"]

@@ -7,6 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import dblquad
 
+from data_tools.claims import analytic as footprint
+from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -14,7 +16,6 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.analytic import footprint
 from minisplat_ref.extensions.analytic.method import INTEGRATED
 from minisplat_ref.extensions.analytic.reference import (
     EXACT_RESPONSE,
@@ -285,12 +286,12 @@ def test_trains_evaluates_and_renders(tmp_path):
 def test_the_study_finds_what_the_docstring_says(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(footprint, "SIGMAS", (0.1, 1.0))
     out = tmp_path / "study"
-    assert main(["study", "analytic/footprint", "--out", str(out)]) == 0
+    assert measure_claim(["analytic/footprint", "--out", str(out)]) == 0
     errors = json.loads((out / "result.json").read_text())["errors"]
     assert errors["round"]["integral, logistic"][0] < 1e-3 < 0.1 < errors["round"]["Mip filter"][0]
     assert errors["round"]["dilation"][0] > 10 > errors["round"]["centre"][0] > 1
     assert 0.02 < errors["needle"]["integral, erf"][0] < 0.2
     assert (out / "figure.png").stat().st_size > 10_000 and "| needle " in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "analytic/footprint", "--places", "0", "--out", str(tmp_path / "none")])
+        measure_claim(["analytic/footprint", "--places", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()

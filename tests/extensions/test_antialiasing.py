@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
+from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
@@ -331,7 +332,7 @@ def test_the_study_measures_all_recipes(tmp_path, capsys):
     out, larger = tmp_path / "study", {**SCENE, "width": 64, "height": 48}
     write_scene(make_scene("room", supersampling=1, **larger), tmp_path / "scene", larger)
     options = [str(tmp_path / "scene"), "--downscale", "2", "--iterations", "30", "--seeds", "1", "--out", str(out)]
-    assert main(["study", "antialiasing/zoom", *options]) == 0
+    assert measure_claim(["antialiasing/zoom", *options]) == 0
     result = json.loads((out / "result.json").read_text())
     assert result["zooms"] == [0.25, 0.5, 1.0, 2.0]
     psnr = {name: seeds[0] for name, seeds in result["psnr"].items()}
@@ -345,5 +346,5 @@ def test_the_study_measures_all_recipes(tmp_path, capsys):
     assert psnr["antialiasing"][0] > psnr["3dgs-accel"][0]  # from far
     assert len({tuple(values) for values in psnr.values()}) == len(psnr) == 8
     assert (out / "figure.png").stat().st_size > 10_000 and "| analytic " in capsys.readouterr().out
-    assert main(["study", "antialiasing/zoom", "nowhere", "--out", str(tmp_path / "none")]) == 2
+    assert measure_claim(["antialiasing/zoom", "nowhere", "--out", str(tmp_path / "none")]) == 2
     assert "neither a folder nor one of" in capsys.readouterr().err and not (tmp_path / "none").exists()

@@ -145,7 +145,6 @@ NOT_AN_EXTENSION = {
         IMPORTS + "EXTENSION = Extension('odd', commands=('x',))",
         "commands is not a tuple",
     ),
-    "a study by name": (IMPORTS + "EXTENSION = Extension('odd', studies=('x',))", "studies is not a tuple of Study"),
     "a population": (
         IMPORTS + "EXTENSION = Extension('odd', representation=3)",
         "is not a Representation",

@@ -22,12 +22,12 @@ from compact import (
     short_run,
     with_header,
 )
+from data_tools.claims import compression as rate_distortion
+from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref import load_ply
-from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression import lattice, levels, msz, spz
-from minisplat_ref.extensions.compression import study as rate_distortion
 from minisplat_ref.io import load_scene
 from minisplat_ref.mechanisms.packing import container as container
 from minisplat_ref.mechanisms.packing.morton import morton_order
@@ -292,9 +292,8 @@ def one_line(capfd, tmp_path):
 
 def study(run, out, *options):
     ply = str(run / "point_cloud.ply")
-    return main(
-        ["study", "compression/rate-distortion", str(run.parent / "nook"), "--ply", ply, "--out", out, *options]
-    )
+    name = "compression/rate-distortion"
+    return measure_claim([name, str(run.parent / "nook"), "--ply", ply, "--out", out, *options])
 
 
 def test_study_of_a_ply(run, tmp_path, capsys):
@@ -360,7 +359,7 @@ def rms(image):
 def test_study_trains(run, tmp_path, capsys):
     nook = str(run.parent / "nook")
     options = ["--recipe", "3dgs-accel", "--iterations", "3", "--seeds", "2", "--out", str(tmp_path / "out")]
-    assert main(["study", "compression/rate-distortion", nook, *options]) == 0
+    assert measure_claim(["compression/rate-distortion", nook, *options]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert len(result["runs"]) == len(result["psnr"]) == 2 and result["iterations"] == 3
     assert "nook" in capsys.readouterr().out
@@ -372,8 +371,8 @@ def test_study_that_cannot_be(run, tmp_path, one_line, capfd):
     ply = str(run / "point_cloud.ply")
     name = "compression/rate-distortion"
     nook = str(run.parent / "nook")
-    assert "not-there does not work" in one_line("study", name, nook, "--ply", ply, "--out", out, *program)
-    assert "neither a folder" in one_line("study", name, "nowhere", "--out", out)
+    assert "not-there does not work" in one_line(name, nook, "--ply", ply, "--out", out, *program, main=measure_claim)
+    assert "neither a folder" in one_line(name, "nowhere", "--out", out, main=measure_claim)
     with pytest.raises(SystemExit, match="2"):
-        main(["study", name, nook, "--out", out, "--seeds", "0"])
+        measure_claim([name, nook, "--out", out, "--seeds", "0"])
     assert "--seeds: '0' is not a whole number of at least 1" in capfd.readouterr().err

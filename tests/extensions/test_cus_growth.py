@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.cus import floats as study
+from data_tools.claims.cus import growth as growth_study
 from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.cus import growth, growth_study, study
+from minisplat_ref.extensions.cus import growth
 from minisplat_ref.extensions.cus.growth import (
     COUNT,
     SUM,
@@ -224,7 +227,7 @@ def test_the_study_of_growing_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CUS", configure(find_recipe("cus"), **SMALL))
     monkeypatch.setattr(study, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
     monkeypatch.setattr(growth_study, "LATENT", SMALL["latent"])
-    assert main(["study", "cus/growth", "--iterations", "230", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
+    assert measure_claim(["cus/growth", "--iterations", "230", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
     records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
     assert [r["arm"] for r in records] == [
         "90 points, without growing",

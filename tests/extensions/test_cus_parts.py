@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.cus import floats as study
+from data_tools.claims.kit.objects import object_ids
 from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.cus import maps, study
+from minisplat_ref.extensions.cus import maps
 from minisplat_ref.extensions.cus.decoding import decode, decode_vjp
 from minisplat_ref.extensions.cus.growth import grow_anchors
 from minisplat_ref.extensions.cus.losses import blended_queries, feature_loss, read_memory
@@ -22,7 +24,6 @@ from minisplat_ref.oracle.models import noisy_model, training_view
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.strategy.ops import take
-from minisplat_ref.studies.objects import object_ids
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.schedule import configure, firing_steps, settings_of

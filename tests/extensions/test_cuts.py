@@ -7,6 +7,8 @@ import pytest
 from matplotlib.path import Path as Polygon
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.cuts import card, edge
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -15,7 +17,6 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.cuts import card, edge
 from minisplat_ref.extensions.cuts.curve import (
     N_EDGES,
     N_PIECES,
@@ -304,22 +305,22 @@ def test_the_width_of_an_edge():
 
 
 def test_the_study(tmp_path, monkeypatch, capsys):
-    from minisplat_ref.extensions.cuts import study
+    from data_tools.claims.cuts import training as study
 
     monkeypatch.setattr(study, "NUMBERS", {"plain": (1,), "cut": (1,)})
     out = tmp_path / "study"
-    assert main(["study", "cuts/card", "--iterations", "5", "--seeds", "2", "--out", str(out)]) == 0
+    assert measure_claim(["cuts/card", "--iterations", "5", "--seeds", "2", "--out", str(out)]) == 0
     assert len(json.loads((out / "result.json").read_text())["rows"]) == 4
     assert (out / "figure.png").stat().st_size > 10_000 and "| cut Gaussian" in capsys.readouterr().out
     monkeypatch.setattr(edge, "NUMBERS", ((2,), (2,), (2,)))
     photographs = tmp_path / "photographs"
     write_scene(make_scene("room", supersampling=1, **SCENE | {"width": 56, "height": 50}), photographs, SCENE)
     options = ["--iterations", "4", "--seeds", "2", "--out", str(tmp_path / "edge")]
-    assert main(["study", "cuts/edge", str(photographs), *options]) == 0
+    assert measure_claim(["cuts/edge", str(photographs), *options]) == 0
     rows = json.loads((tmp_path / "edge" / "result.json").read_text())["rows"]
     assert [row["n_floats"] for row in rows] == [28, 44, 60] and "| 2 curves" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "cuts/card", "--seeds", "0", "--out", str(tmp_path / "none")])
+        measure_claim(["cuts/card", "--seeds", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()
 
 

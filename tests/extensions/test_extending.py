@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import minisplat_ref
+from data_tools.claims import find_claim
+from data_tools.claims.__main__ import parser_of
 from minisplat_ref import extensions
 from minisplat_ref.cli import _parser_of, main
 from minisplat_ref.extensions.extension import find_recipe, load_extension
@@ -72,6 +74,10 @@ def test_code_stands_in_its_file(file, block):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_parse(command, tmp_path, monkeypatch):
     program, *arguments = shlex.split(command)
+    if program == "python":
+        assert arguments[:2] == ["-m", "data_tools.claims"]
+        parser_of(arguments[2], find_claim(arguments[2])).parse_args(arguments[3:])
+        return
     assert program == "minisplat-ref"
     assert callable(_parser_of(arguments).parse_args(arguments).run)
     for option, value in itertools.pairwise(arguments):

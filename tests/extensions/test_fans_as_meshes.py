@@ -8,6 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.fans.profile import fan_profile, mass, profile_error
 from gltf import glb_parts, only_primitive, values
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -18,7 +20,6 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans, write_mesh
 from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, keep_in_range, prune_faint_fans, render, render_vjp
-from minisplat_ref.extensions.fans.profile import fan_profile, mass, profile_error
 from minisplat_ref.extensions.fans.shapes import (
     Fans,
     FanShape,
@@ -456,20 +457,20 @@ def test_models_that_hold_nothing_are_refused(model, scene_folder, tmp_path, cap
 
 
 def test_the_studies(scene_folder, model, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("minisplat_ref.extensions.fans.claims.REACHES", (2.5,))
-    monkeypatch.setattr("minisplat_ref.extensions.fans.claims.SIDES", (4, 8))
-    monkeypatch.setattr("minisplat_ref.extensions.fans.claims.VIEWS_MAX", 1)
+    monkeypatch.setattr("data_tools.claims.fans.measures.REACHES", (2.5,))
+    monkeypatch.setattr("data_tools.claims.fans.measures.SIDES", (4, 8))
+    monkeypatch.setattr("data_tools.claims.fans.measures.VIEWS_MAX", 1)
     monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.EVALUATIONS", 4)
     monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.FIRST_REACHES", (2.5,))
-    monkeypatch.setattr("minisplat_ref.extensions.fans.profile.ANGLES", (0, 90))
+    monkeypatch.setattr("data_tools.claims.fans.profile.ANGLES", (0, 90))
     refit, profile = tmp_path / "refit", tmp_path / "profile"
     options = ["--ply", str(model), "--fine-tune", "3", "--out", str(refit)]
-    assert main(["study", "fans/refit", str(scene_folder), *options]) == 0
+    assert measure_claim(["fans/refit", str(scene_folder), *options]) == 0
     (run,) = json.loads((refit / "result.json").read_text())["runs"]
     assert [row["form"] for row in run["rows"] if "triangles" in row][::3] == ["flat fans", "solid fans"]
     assert (refit / "figure.png").stat().st_size > 10_000 and "| flat fans, vertices" in capsys.readouterr().out
     assert sorted(path.name for path in refit.iterdir()) == ["figure.png", "result.json"]
-    assert main(["study", "fans/profile", "--out", str(profile)]) == 0
+    assert measure_claim(["fans/profile", "--out", str(profile)]) == 0
     tilts = json.loads((profile / "result.json").read_text())["tilts"]
     edge_on = {(tilt["kind"], tilt["is_flat"]): tilt["errors"][1] for tilt in tilts}
     assert edge_on["ball", True] > 0.99 > edge_on["ball", False]

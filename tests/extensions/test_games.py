@@ -5,11 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 
+from data_tools.claims import games as study
+from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.games import study
 from minisplat_ref.extensions.games.faces import FaceGaussians, face_frames, on_own_faces, place, place_vjp
 from minisplat_ref.extensions.games.method import ON_FACES, from_mesh, on_faces
 from minisplat_ref.io.frames import place_scene, return_population
@@ -223,7 +224,7 @@ def test_the_study_compares_on_and_off_the_faces(tmp_path, monkeypatch, wall, ca
     monkeypatch.setattr(study, "make_scene", lambda name: wall)
     monkeypatch.setattr(study, "ARMS", (("exact mesh", 1),))
     monkeypatch.setattr(study, "VOXEL", 0.5)
-    assert main(["study", "games/counts", "x", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
+    assert measure_claim(["games/counts", "x", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| exact")]
     assert len(lines) == 2
     counts = [line.split("|")[2].strip() for line in lines]

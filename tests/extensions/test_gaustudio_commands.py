@@ -6,8 +6,10 @@ import re
 import numpy as np
 import pytest
 
+from data_tools.claims import gaustudio as study
+from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref.cli import main
-from minisplat_ref.extensions.gaustudio import modules, study
+from minisplat_ref.extensions.gaustudio import modules
 from minisplat_ref.extensions.gaustudio.modules import DEPTHS, STAGES, all_stages
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image
@@ -98,25 +100,25 @@ def test_bad_names_are_one_line(folder, capsys, setting, message):
 def test_the_study_of_the_sky(folder, tmp_path, capsys):
     arms = ["--arms", "without,ball+loss", "--iterations", "60", "--seeds", "0"]
     scene, masks = str(folder / "scene"), ["--masks", str(folder / "masks")]
-    assert main(["study", "gaustudio/sky", scene, *masks, *arms, "--out", str(tmp_path / "sky")]) == 0
+    assert measure_claim(["gaustudio/sky", scene, *masks, *arms, "--out", str(tmp_path / "sky")]) == 0
     without, both = json.loads((tmp_path / "sky" / "result.json").read_text())["records"]
     assert both["opacity"] < 0.8 * without["opacity"] and both["psnr_sky"] > without["psnr_sky"]
     assert both["opacity"] < both["opacity_scene"] <= 1
     assert "| ball+loss" in capsys.readouterr().out
-    assert main(["study", "gaustudio/sky", scene, "--arms", "moon", "--out", str(tmp_path / "x")]) == 2
+    assert measure_claim(["gaustudio/sky", scene, "--arms", "moon", "--out", str(tmp_path / "x")]) == 2
     assert "--arms moon is unknown: choose from without, loss, ball" in capsys.readouterr().err
 
 
 def test_the_study_of_swaps(folder, tmp_path, capsys):
     options = ["--stages", "photo_loss", "--iterations", "5", "--seeds", "0", "--out", str(tmp_path / "swaps")]
-    assert main(["study", "gaustudio/swaps", str(folder / "scene"), *options]) == 0
+    assert measure_claim(["gaustudio/swaps", str(folder / "scene"), *options]) == 0
     records = json.loads((tmp_path / "swaps" / "result.json").read_text())["records"]
     assert [record["arm"] for record in records] == ["as it is", "photo_loss=l1", "photo_loss=squared"]
     assert len(study.swaps(study.SWAPPED)) == 1 + sum(
         len(stage.modules) - 1 for stage in modules.all_stages() if stage.name != "sky_mask"
     )
     assert (
-        main(["study", "gaustudio/swaps", str(folder / "scene"), "--stages", "sky", "--out", str(tmp_path / "y")]) == 2
+        measure_claim(["gaustudio/swaps", str(folder / "scene"), "--stages", "sky", "--out", str(tmp_path / "y")]) == 2
     )
     assert "--stages sky is unknown: choose from initialiser" in capsys.readouterr().err
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from data_tools.claims.gdgs.sphere import measure
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
@@ -22,7 +23,6 @@ from minisplat_ref.extensions.gdgs.reference import (
     regions_of,
     unevenness,
 )
-from minisplat_ref.extensions.gdgs.study import measure
 from minisplat_ref.mechanisms.oriented.planes import LocalPlanes
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between, normals_of
 from minisplat_ref.rendering import Request

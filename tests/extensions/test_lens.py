@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.lens import fisheye, footprints
+from data_tools.claims.lens.fisheye import rays_of, take_photographs
 from gradcheck import check_inner_products
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -14,8 +17,6 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.lens import fisheye, footprints
-from minisplat_ref.extensions.lens.fisheye import rays_of, take_photographs
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
 from minisplat_ref.extensions.lens.stages import OPTICS, stages
 from minisplat_ref.io import load_scene, viewpoints
@@ -180,7 +181,7 @@ def test_small_balls_are_drawn_by_every_footprint(kind, edge):
 
 def test_the_study_of_footprints(tmp_path):
     """On a small set: EWA and the unscented conic err more off the axis, and the exact response hardly."""
-    assert main(["study", "lens/footprints", "--gaussians", "2", "--out", str(tmp_path)]) == 0
+    assert measure_claim(["lens/footprints", "--gaussians", "2", "--out", str(tmp_path)]) == 0
     for errors in json.loads((tmp_path / "result.json").read_text())["errors"].values():
         assert errors["EWA"][-1] > errors["EWA"][0] > errors["UT"][0] > 0.02
         assert max(errors["exact"]) < 0.05  # what the bounds leave out
@@ -232,13 +233,13 @@ def test_what_undistortion_keeps(photographs):
 
 def test_the_study_of_the_fisheye(tmp_path, capsys):
     """At a tiny size; the arms have equal numbers of Gaussians, and the folder resumes without another training."""
-    out = ["study", "lens/fisheye", "--width", "24", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert main(out) == 0
+    out = ["lens/fisheye", "--width", "24", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert measure_claim(out) == 0
     result = json.loads((tmp_path / "s" / "result.json").read_text())
     assert len(result["records"]) == 3 and len({record["gaussians"] for record in result["records"]}) == 1
     assert len({record["border"] for record in result["records"]}) == 3
     capsys.readouterr()
-    assert main(out) == 0 and "undistortion keeps" in capsys.readouterr().out
+    assert measure_claim(out) == 0 and "undistortion keeps" in capsys.readouterr().out
     assert json.loads((tmp_path / "s" / "result.json").read_text()) == result
 
 

@@ -8,14 +8,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import gaussian_filter, shift
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.lucas_kanade import body as bodies
+from data_tools.claims.lucas_kanade import trainings as study
 from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.lucas_kanade import body as bodies
-from minisplat_ref.extensions.lucas_kanade import losses, pyramid, study
+from minisplat_ref.extensions.lucas_kanade import losses, pyramid
 from minisplat_ref.extensions.lucas_kanade.losses import depth_order, flow, next_view, ordered_pairs, rendered_flow
 from minisplat_ref.extensions.lucas_kanade.method import WARPED, first_warp
 from minisplat_ref.extensions.lucas_kanade.moving import CENTERS, GROWTHS, LOG_WIDTH, SHIFTS, TURNS, moved
@@ -527,7 +529,7 @@ def test_the_body_turns_and_grows(rng):
 
 
 def test_forms_are_measured(capsys):
-    assert main(["study", "lucas-kanade/forms", "--seeds", "1"]) == 0
+    assert measure_claim(["lucas-kanade/forms", "--seeds", "1"]) == 0
     lines = [line.strip("| ").split("|") for line in capsys.readouterr().out.splitlines()]
     errors = {line[0].strip(): float(line[1]) for line in lines[2:]}
     assert errors["(i) and (iii), the latter by differences"] < 1e-7 and errors["(i) and J (ii)"] < 1e-12
@@ -540,7 +542,7 @@ def test_the_study_measures_its_arms(monkeypatch, tmp_path, capsys):
     for name, value in (("WIDTH", 48), ("HEIGHT", 32), ("FOCAL", 55.0)):
         monkeypatch.setattr(bodies, name, value)
     out = tmp_path / "out"
-    assert main(["study", "lucas-kanade/body", "--iterations", "30", "--seeds", "0", "--out", str(out)]) == 0
+    assert measure_claim(["lucas-kanade/body", "--iterations", "30", "--seeds", "0", "--out", str(out)]) == 0
     records = {record["arm"]: record for record in json.loads((out / "result.json").read_text())["records"]}
     assert list(records) == [f"{camera}, {arm}" for camera in study.CAMERAS for arm in study.LOSSES]
     for camera in study.CAMERAS:

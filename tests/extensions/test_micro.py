@@ -8,6 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.micro.counts import CURVES
 from gradcheck import check_jacobian
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
@@ -15,7 +17,6 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.micro.counts import CURVES
 from minisplat_ref.extensions.micro.method import (
     clone_and_split_by_detail,
     clusters,
@@ -357,23 +358,23 @@ def test_a_setting_that_it_does_not_have_is_refused(scene_folder, tmp_path, caps
 
 def test_the_study_measures_at_equal_count(tmp_path, capsys):
     out = tmp_path / "study"
-    assert main(["study", "micro/checker", "--iterations", "130", "--seeds", "1", "--out", str(out)]) == 0
+    assert measure_claim(["micro/checker", "--iterations", "130", "--seeds", "1", "--out", str(out)]) == 0
     found = json.loads((out / "result.json").read_text())["variants"]
     assert {tuple(numbers["n"]) for numbers in found.values()} == {(840,)}
     assert found["both"]["psnr_edges"][0] > found["3dgs"]["psnr_edges"][0]
     assert (out / "figure.png").stat().st_size > 10_000
     assert "| both " in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "micro/checker", "--seeds", "0", "--out", str(tmp_path / "none")])
+        measure_claim(["micro/checker", "--seeds", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()
 
 
 def test_the_study_measures_quality_against_count(scene_folder, tmp_path, capsys, monkeypatch):
     short = {name: curve._replace(points=curve.points[:1]) for name, curve in CURVES.items()}
-    monkeypatch.setattr("minisplat_ref.extensions.micro.counts.CURVES", short)
+    monkeypatch.setattr("data_tools.claims.micro.counts.CURVES", short)
     out = tmp_path / "counts"
     options = ["--iterations", "300", "--seeds", "1", "--out", str(out)]
-    assert main(["study", "micro/counts", str(scene_folder), *options]) == 0
+    assert measure_claim(["micro/counts", str(scene_folder), *options]) == 0
     plain, first, both = json.loads((out / "result.json").read_text())["records"]
     assert both["n_gaussians"] < first["n_gaussians"] and plain["settings"] == {"threshold": 2e-4}
     assert (out / "figure.png").stat().st_size > 10_000 and "| micro, first stage alone | " in capsys.readouterr().out

@@ -7,6 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from actions import act, scene_of, state_of
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.kit import psnr_of
+from data_tools.claims.mixed import fit
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -19,7 +22,6 @@ from minisplat_ref.cpu.compositing.plain_conic import composite as composite_con
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.mixed import fit
 from minisplat_ref.extensions.mixed.kernels import response_for
 from minisplat_ref.extensions.mixed.kinds import coverage, promote_kinds, simplify_kinds, whiten_vertices
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simplify_hulls
@@ -37,7 +39,6 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import Request
-from minisplat_ref.studies.kit import psnr_of
 from minisplat_ref.types import Gaussians, Model, Primitives, Projection, TileGrid, view_from
 from payloads import drawn
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
@@ -510,27 +511,27 @@ def test_numbers_are_counted_as_they_are_used(n_vertices, rng):
 
 @pytest.mark.parametrize(("name", "n_images"), [("shapes", 3), ("letter", 2)])
 def test_the_studies_of_images(name, n_images, tmp_path, monkeypatch, capsys):
-    from minisplat_ref.extensions.mixed import study
+    from data_tools.claims.mixed import shapes as study
 
     monkeypatch.setitem(study.NUMBERS, name, {1: (1,), 2: (1,), 3: (1,)})
     monkeypatch.setitem(study.SHOWN, name, {1: 1, 2: 1, 3: 1})
     out = tmp_path / "study"
-    assert main(["study", f"mixed/{name}", "--iterations", "3", "--seeds", "2", "--out", str(out)]) == 0
+    assert measure_claim([f"mixed/{name}", "--iterations", "3", "--seeds", "2", "--out", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
     assert len(result["rows"]) == len(result["needed"]) == 3 * n_images
     assert (out / "figure.png").stat().st_size > 10_000 and "| triangles" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", f"mixed/{name}", "--seeds", "0", "--out", str(tmp_path / "none")])
+        measure_claim([f"mixed/{name}", "--seeds", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()
 
 
 def test_the_study_of_scenes(tmp_path, capsys):
     write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
     options = ["--downscale", "1", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "study")]
-    assert main(["study", "mixed/scene", str(tmp_path / "nook"), *options]) == 0
+    assert measure_claim(["mixed/scene", str(tmp_path / "nook"), *options]) == 0
     whole, equal, groups_alone, mixed = json.loads((tmp_path / "study" / "result.json").read_text())["rows"]
     assert whole["n_floats"] > mixed["n_floats"] >= equal["n_floats"] > 0.95 * mixed["n_floats"]
     assert groups_alone["number"] == mixed["number"] == sum(mixed["kinds"]) and mixed["kinds"][1] > 0
     assert "mixed" in capsys.readouterr().out
-    assert main(["study", "mixed/scene", str(tmp_path / "gone"), *options[:-1], str(tmp_path / "none")]) == 2
+    assert measure_claim(["mixed/scene", str(tmp_path / "gone"), *options[:-1], str(tmp_path / "none")]) == 2
     assert "gone" in capsys.readouterr().err and not (tmp_path / "none").exists()

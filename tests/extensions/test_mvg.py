@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims import mvg as study
 from gradcheck import check_jacobian
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.mvg import insertion, method, study
+from minisplat_ref.extensions.mvg import insertion, method
 from minisplat_ref.extensions.mvg.insertion import Insertions, Photographed, Rules, propose, uncovered
 from minisplat_ref.extensions.mvg.losses import depth_steps, filtered_normals
 from minisplat_ref.extensions.mvg.method import MVG, facing, photographed, surfels_at

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.negative import CLAIMS, backdrop, rings
 from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
@@ -16,7 +17,6 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.negative import STUDIES, backdrop, rings
 from minisplat_ref.extensions.negative.method import (
     FRACTION,
     SIGNED,
@@ -381,7 +381,7 @@ def test_a_fit_before_a_wall_moves_parallel_to_the_image(monkeypatch):
 
 
 def run_study(name, folder, *arguments):
-    (study,) = (study for study in STUDIES if study.name == name)
+    (study,) = (study for study in CLAIMS if study.name == name)
     parser = argparse.ArgumentParser()
     study.add_arguments(parser)
     assert not study.run(parser.parse_args(["--out", str(folder), *arguments]))
@@ -416,7 +416,7 @@ def test_backdrop_a_negative_color_blackens_a_hole_and_does_not_open_it(tmp_path
     assert "| dots  | 4, clamped " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("study", STUDIES)
+@pytest.mark.parametrize("study", CLAIMS)
 def test_studies_refuse_to_fit_nothing(study, tmp_path, capsys):
     parser = argparse.ArgumentParser()
     study.add_arguments(parser)
@@ -487,5 +487,4 @@ def test_interrupted_then_resumed_gives_the_bytes_of_an_uninterrupted_run(
 def test_extension_is_found():
     extension = load_extension("negative")
     assert [recipe.name for recipe in extension.recipes] == ["negative"]
-    assert {study.name for study in extension.studies} == {"rings", "backdrop"}
     assert find_recipe("mini-splatting", extension="negative").representation is SIGNED

@@ -10,6 +10,7 @@ from scipy.cluster.vq import kmeans2
 
 from actions import act, scene_of, state_of
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
+from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref import load_ply, load_scene, save_ply
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
@@ -421,8 +422,8 @@ def test_study_of_files(folders, tmp_path, capsys):
     """Sizes and losses in the table are those of the files."""
     nook, run = folders
     checkpoint = run / "checkpoint.npz"
-    command = ["study", "omg/files", str(nook), "--checkpoints", str(checkpoint), "--out", str(tmp_path / "out")]
-    assert main(command) == 0
+    command = ["omg/files", str(nook), "--checkpoints", str(checkpoint), "--out", str(tmp_path / "out")]
+    assert measure_claim(command) == 0
     (record,) = json.loads((tmp_path / "out" / "result.json").read_text())["runs"]
     rows = {row["file"]: row for row in record["rows"]}
     assert rows["as trained"]["lost"] == 0 and {".spz 0", ".msz 0", ".omg 4", ".omg of the training"} < set(rows)
@@ -434,7 +435,7 @@ def test_study_of_files(folders, tmp_path, capsys):
 
 def test_study(folders, tmp_path, capsys):
     nook, run = folders
-    command = ["study", "omg/distinctiveness", str(nook), "--fine-tune", "3", "--seeds", "0", "--ply"]
+    command = ["omg/distinctiveness", str(nook), "--fine-tune", "3", "--seeds", "0", "--ply"]
     save_ply(tmp_path / "two.ply", take(load_ply(run / "point_cloud.ply"), np.arange(2)))
     few = [*command, str(tmp_path / "two.ply"), "--out", str(tmp_path / "few")]
     assert main(few) == 2  # two Gaussians differ from each other alike: both choices keep the same

@@ -35,16 +35,6 @@ The colour of degree 0 at time t is sh_dc + t g, the same for red, green and blu
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.glow import brightest
 from minisplat_ref.extensions.glow.method import GLOWING, PENALTY, RECIPE
-from minisplat_ref.studies.study import Study
-
-
-def count(args):
-    print("counted", args.what)
-
-
-def add_arguments(parser):
-    parser.add_argument("--what", default="nothing")
-
 
 EXTENSION = Extension(
     "glow",
@@ -52,7 +42,6 @@ EXTENSION = Extension(
     representation=GLOWING,
     losses=(PENALTY,),
     commands=(brightest,),
-    studies=(Study("count", "counts", add_arguments, count),),
 )
 ''',
     "kernels.py": '''\
@@ -240,7 +229,6 @@ def test_it_is_listed_and_described(stranger):
         "trains    glowing Gaussians",
         "losses    glow_penalty",
         "commands  minisplat-ref glow brightest",
-        "studies   glow/count",
     ):
         assert line in out
 
@@ -278,8 +266,6 @@ def test_the_other_commands_know_it(stranger, run_folder):
     assert f"further fields  glow [{n}]" in stranger.run("info", run_folder / "checkpoint.npz")
     trained = read_vertices(run_folder / "point_cloud.ply")["glow"]
     assert stranger.run("glow", "brightest", run_folder / "point_cloud.ply") == f"brightest {trained.argmax()}\n"
-    assert stranger.run("study", "glow/count", "--what", "sheep") == "counted sheep\n"
-    assert "glow/count" in stranger.run("extensions", "glow")
     for backend in ("reference", "cpu"):
         said = stranger.run("oracle", "gradients", "--extension", "glow", "--backend", backend)
         assert "all 4 cases passed" in said and "loss term glow_penalty: Jacobian" in said

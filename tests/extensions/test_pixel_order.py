@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims import pixel_order as clouds
+from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench import extension_times
@@ -19,7 +21,6 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
 from minisplat_ref.mechanisms.tangent import planes as planes
@@ -462,11 +463,11 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
 def test_the_studies(study, options, says, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(clouds, "ORBIT_STEPS", 2)
     out = tmp_path / "study"
-    assert main(["study", f"pixel-order/{study}", *options, "--out", str(out)]) == 0
+    assert measure_claim([f"pixel-order/{study}", *options, "--out", str(out)]) == 0
     assert (out / "figure.png").stat().st_size > 10_000 and says in capsys.readouterr().out
     assert json.loads((out / "result.json").read_text())
     with pytest.raises(SystemExit, match="2"):
-        main(["study", f"pixel-order/{study}", "--gaussians", "0", "--out", str(tmp_path / "none")])
+        measure_claim([f"pixel-order/{study}", "--gaussians", "0", "--out", str(tmp_path / "none")])
     assert not (tmp_path / "none").exists()
 
 
@@ -497,7 +498,7 @@ def test_whole_gaussians_that_change_places_at_once_make_the_image_jump():
 
 
 def test_a_run_without_test_views_is_refused(tmp_path, capsys):
-    assert main(["study", "pixel-order/order", "--ply", str(tmp_path / "no.ply"), "--out", str(tmp_path / "o")]) == 2
+    assert measure_claim(["pixel-order/order", "--ply", str(tmp_path / "no.ply"), "--out", str(tmp_path / "o")]) == 2
     assert not (tmp_path / "o").exists() and "no.ply" in capsys.readouterr().err
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.polygons import edits as claims
 from minisplat_ref.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.polygons import claims
 from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, save_soup, soup_of
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.io.ply_faces import read_faces
@@ -274,7 +275,7 @@ def test_the_studies_draw_and_print(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(claims, "ANGLES", (10, 20))
     monkeypatch.setattr(claims, "PER_SIDE", (4, 8))
     out = tmp_path / "study"
-    assert main(["study", "polygons/edits", "--seeds", "1", "--out", str(out)]) == 0
+    assert measure_claim(["polygons/edits", "--seeds", "1", "--out", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
     assert max(result["round trip"].values()) < PARITY_FLOAT64
     for name, errors in result["affine"].items():
@@ -282,6 +283,6 @@ def test_the_studies_draw_and_print(tmp_path, capsys, monkeypatch):
     assert result["affine"]["shear"]["covariance, Gram-Schmidt"] > 0.1
     assert (out / "figure.png").stat().st_size > 20_000 and "| shear" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "polygons/edits", "--seeds", "0", "--out", str(tmp_path / "none")])
+        measure_claim(["polygons/edits", "--seeds", "0", "--out", str(tmp_path / "none")])
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "polygons/cost", "--repeats", "0"])
+        measure_claim(["polygons/cost", "--repeats", "0"])

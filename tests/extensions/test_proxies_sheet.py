@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.proxies import affine as edit_claims
+from data_tools.claims.proxies import sheet as sheet_claims
+from data_tools.claims.proxies.affine import roll, rolled_jacobian
 from minisplat_ref.cli import main
-from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
 from minisplat_ref.extensions.proxies import fall as fall_command
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.proxies.edit_claims import roll, rolled_jacobian
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
 from minisplat_ref.extensions.proxies.mass_spring import (
     Floor,
@@ -375,7 +377,7 @@ def test_the_derivative_of_the_cylinder(rng):
 
 
 def test_the_study_of_edits(tmp_path, capsys):
-    assert main(["study", "proxies/affine", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
+    assert measure_claim(["proxies/affine", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     for errors in result["edits"].values():
         assert 0 < errors["centre"] < 1e-12 and 0 < errors["covariance"] < 1e-12 and 0 < errors["color"] < 1e-12
@@ -393,11 +395,11 @@ def test_the_study_of_sheets(tmp_path, capsys, monkeypatch):
     small |= {"SETTLING": 0.5, "SWING_CELLS": 4, "SAMPLES": 8}
     for name, value in small.items():
         monkeypatch.setattr(sheet_claims, name, value)
-    assert main(["study", "proxies/sheet", "--out", str(tmp_path / "out")]) == 0
+    assert measure_claim(["proxies/sheet", "--out", str(tmp_path / "out")]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert 0 < result["free_fall"]["centre"] < 1e-12 and result["free_fall"]["covariance"] < 1e-12
     assert set(result["hanging"]) == {"0.01", "0.001"} and set(result["energy"]) == set(sheet_claims.SWINGS)
     assert "free fall for 1 s" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "proxies/affine", "--seeds", "0", "--out", str(tmp_path / "no")])
+        measure_claim(["proxies/affine", "--seeds", "0", "--out", str(tmp_path / "no")])
     assert not (tmp_path / "no").exists() and edit_claims.CELLS

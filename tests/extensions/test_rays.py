@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.rays import measures as claims
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -19,7 +21,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import claims, reference
+from minisplat_ref.extensions.rays import reference
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
 from minisplat_ref.extensions.rays.stages import stages
@@ -398,11 +400,11 @@ def test_the_degenerate_case_is_one_gaussian_on_the_axis(rng):
 
 
 def test_the_speed_is_told_with_its_error(capsys):
-    assert main(["study", "rays/speed", "--gaussians", "200", "--repeats", "1"]) == 0
+    assert measure_claim(["rays/speed", "--gaussians", "200", "--repeats", "1"]) == 0
     out = capsys.readouterr().out
     assert " a ray takes " in out and float(re.search(r"error of float32 +\| +(\S+)", out)[1]) < PARITY_FLOAT32_IMAGE
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "rays/speed", "--repeats", "0"])
+        measure_claim(["rays/speed", "--repeats", "0"])
 
 
 def test_limits_hold_every_hit_that_counts():

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.rays import demo
+from data_tools.claims.rays import measures as claims
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import claims, demo, surroundings
+from minisplat_ref.extensions.rays import surroundings
 from minisplat_ref.extensions.rays.lights import irradiance, shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whiten_model
 from minisplat_ref.extensions.rays.reference import intersect
@@ -300,7 +303,7 @@ def test_a_light_in_a_faint_gaussian_is_taken():
 
 def test_the_study_draws_and_prints(tmp_path, capsys):
     out = tmp_path / "study"
-    assert main(["study", "rays/claims", "--gaussians", "60", "--out", str(out)]) == 0
+    assert measure_claim(["rays/claims", "--gaussians", "60", "--out", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
     for name in ("tree against brute force", "tracing against exact order", "mirror against mirrored camera"):
         assert result[name] < RAY_ORDER
@@ -308,7 +311,7 @@ def test_the_study_draws_and_prints(tmp_path, capsys):
     assert all((np.diff(values) > 0).all() for values in errors.values())
     assert (out / "figure.png").stat().st_size > 20_000 and "| edge of a shadow" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        main(["study", "rays/claims", "--gaussians", "0", "--out", str(tmp_path / "none")])
+        measure_claim(["rays/claims", "--gaussians", "0", "--out", str(tmp_path / "none")])
 
 
 # --- a peer ---

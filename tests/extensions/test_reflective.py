@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims import reflective as study
 from minisplat_ref.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.reflective import study
 from minisplat_ref.extensions.reflective.method import RECIPE
 from minisplat_ref.io.images import read_image
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT

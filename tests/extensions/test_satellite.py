@@ -7,11 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
+from data_tools.claims.satellite import boxes
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite import affine_fit, boxes, reference, rpc, utm
+from minisplat_ref.extensions.satellite import affine_fit, reference, rpc, utm
 from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
 from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference, hold_sky
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE

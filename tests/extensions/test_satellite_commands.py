@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from test_satellite import make_rpc, text_of
 
+from data_tools.claims.satellite.measures import perspective_residual
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.satellite.claims import perspective_residual
 from minisplat_ref.extensions.satellite.rpc import read_rpc
 from minisplat_ref.extensions.satellite.training import read_images, read_suns
 from minisplat_ref.io import save_ply, write_image

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minisplat_ref.cli import main
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.satellite import boxes
+from data_tools.claims.satellite import measures as claims
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite import affine_fit, boxes, claims
+from minisplat_ref.extensions.satellite import affine_fit
 from minisplat_ref.extensions.satellite.losses import shear_of, view_consistency
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.extensions.satellite.surface_model import surface_model
@@ -198,8 +200,8 @@ def test_the_study_of_boxes_runs(tmp_path, monkeypatch, capsys):
     for module, name, value in ((claims, "SIZE", 16), (claims, "N_POINTS", 60)):
         monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(claims, "make_scene", partial(boxes.make_scene, size=16))
-    command = ["study", "satellite/boxes", "--iterations", "2", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert main(command) == 0
+    command = ["satellite/boxes", "--iterations", "2", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert measure_claim(command) == 0
     said = capsys.readouterr().out
     assert all(said.count(f"| {arm} ") == 1 for arm in claims.ARMS)
     heights = boxes.make_scene(0, size=16).heights
@@ -214,7 +216,7 @@ def test_the_study_of_boxes_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_the_study_of_distances_runs(tmp_path, capsys):
-    assert main(["study", "satellite/distance", "--out", str(tmp_path / "d")]) == 0
+    assert measure_claim(["satellite/distance", "--out", str(tmp_path / "d")]) == 0
     said = capsys.readouterr().out
     at_nadir = {km: float(value) for km, angle, value in rows_of(said) if angle == "0"}
     by_hand = {km: 353.5 / 0.3 * 50 / (1e3 * float(km)) for km in ("5", "50", "500")}  # as in test_satellite

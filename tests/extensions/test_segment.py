@@ -10,11 +10,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.optimize import linprog
 
+from data_tools.claims import segment as study
+from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.segment import study
 from minisplat_ref.extensions.segment.assignment import belongs, labels
 from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.render import paint
@@ -317,7 +318,7 @@ def test_masks_are_shifted_and_lost():
 
 
 def test_iou_by_hand(monkeypatch):
-    monkeypatch.setattr("minisplat_ref.studies.objects.OBJECTS", ((1,), (2,)))
+    monkeypatch.setattr("data_tools.claims.kit.objects.OBJECTS", ((1,), (2,)))
     truth, found = np.array([[1, 1, 2, 0]]), np.array([[1, 2, 2, 2]])
     assert study.mean_iou([found], [truth]) == pytest.approx((1 / 2 + 1 / 3) / 2)
 
@@ -327,7 +328,7 @@ def test_the_study_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "BIASES", (0.0, 0.4))
     small = partial(make_scene, n_views=9, width=64, height=48, supersampling=1, n_points=2000)
     monkeypatch.setattr(study, "make_scene", small)
-    words = ["study", "segment/masks", "--iterations", "40", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert main(words) == 0
+    words = ["segment/masks", "--iterations", "40", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert measure_claim(words) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| clean"))
     assert float(line.split("|")[2].split()[0]) > 0.2

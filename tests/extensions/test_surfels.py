@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from data_tools.claims import surfels as study
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.surfels import ARMS, outcome
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.surfels import study
-from minisplat_ref.extensions.surfels.study import ARMS, outcome
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.surfels.discs import as_surfels
 from minisplat_ref.mechanisms.surfels.losses import distortion, median_normal_consistency, normal_consistency
@@ -138,8 +139,8 @@ def test_the_study_measures_the_truth_as_it_is(monkeypatch):
 
 def test_the_study_of_losses_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "make_scene", lambda name: make_scene(name, n_views=4, width=24, height=18))
-    command = ["study", "surfels/losses", "room", "--iterations", "2", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert main(command) == 0
+    command = ["surfels/losses", "room", "--iterations", "2", "--seeds", "1", "--out", str(tmp_path / "s")]
+    assert measure_claim(command) == 0
     said = capsys.readouterr().out
     assert all(said.count(f"| {arm} ") == 1 for arm in ARMS)
     records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims import texture_splat as study
 from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.texture_splat import EXTENSION, kernels, reference, study
+from minisplat_ref.extensions.texture_splat import EXTENSION, kernels, reference
 from minisplat_ref.extensions.texture_splat.baking import Maps, bake
 from minisplat_ref.extensions.texture_splat.population import CHANNELS, TexturedSurfels, texels_of, with_textures
 from minisplat_ref.extensions.texture_splat.reference import (

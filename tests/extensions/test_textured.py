@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.kit import read_scene
+from data_tools.claims.textured import colors_across
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -16,13 +19,11 @@ from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.extensions.textured.reference import LIMB, frames, frames_vjp, meet, meet_vjp
 from minisplat_ref.extensions.textured.response import RESPONSE, TexturedFootprints, bounds
-from minisplat_ref.extensions.textured.study import colors_across
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import Request
-from minisplat_ref.studies.kit import read_scene
 from minisplat_ref.types import Model, Projection, view_from
 from payloads import drawn, random_textures
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
@@ -252,11 +253,11 @@ def exit_code(command):
 def test_the_studies(scene_folder, run_folder, tmp_path, capsys):
     out, ply = tmp_path / "study", str(run_folder / "point_cloud.ply")
     options = ["--ply", ply, "--fine-tune", "3", "--out", str(out)]
-    assert main(["study", "textured/counts", str(scene_folder), *options]) == 0
+    assert measure_claim(["textured/counts", str(scene_folder), *options]) == 0
     (rows,) = json.loads((out / "result.json").read_text())["runs"]
     assert [row["form"] for row in rows].count("textures for view") == 4
     fewer = [row["n_floats"] for row in rows if row["kept"] == "as many floats"]
     assert len(fewer) == 2 and max(fewer) <= rows[0]["n_floats"]
     assert (out / "figure.png").stat().st_size > 10_000 and "| as many floats" in capsys.readouterr().out
-    assert main(["study", "textured/limb"]) == 0
+    assert measure_claim(["textured/limb"]) == 0
     assert "nearest point beyond" in capsys.readouterr().out

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.vdgs import floats as floats_study
+from data_tools.claims.vdgs import pane as study
 from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.vdgs import floats_study, modes, study
+from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import (
     CENTER,
     NAME,
@@ -253,8 +256,8 @@ def test_a_baked_view_is_that_view(run_folder, tmp_path, capfd):
 
 
 def test_the_pane(tmp_path):
-    arguments = ["study", "vdgs/pane", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "pane")]
-    assert main(arguments) == 0
+    arguments = ["vdgs/pane", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "pane")]
+    assert measure_claim(arguments) == 0
     result = json.loads((tmp_path / "pane" / "result.json").read_text())
     assert [record["arm"] for record in result["records"]] == [study.HARMONICS, study.TIMES, study.PLUS]
     truth = study.make_pane(np.random.default_rng(0))

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.velocity import make_moving_gaussians, outcome, photographs
 from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -14,7 +16,6 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
 from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
-from minisplat_ref.extensions.velocity.study import make_moving_gaussians, outcome, photographs
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import load_ply, save_ply
@@ -218,13 +219,13 @@ def test_velocities_are_found(seed, record_property):
 
 
 def test_the_study_prints_what_it_measures(capsys):
-    assert main(["study", "velocity/motion", "--iterations", "20"]) == 0
+    assert measure_claim(["velocity/motion", "--iterations", "20"]) == 0
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in capsys.readouterr().out.splitlines()]
     truth = make_moving_gaussians(np.random.default_rng(0))
     expected = outcome(find_recipe("velocity", 20), truth, 0)
     assert rows[0] == ["recipe", "PSNR dB", "error of velocities"] and rows[2][0] == "3dgs-accel"
     assert rows[3] == ["velocity", f"{expected.psnr:.2f}", f"{expected.velocity_rmse:.4f}"]
-    assert main(["study", "velocity/rest"]) == 2
+    assert measure_claim(["velocity/rest"]) == 2
     assert "there is no study 'velocity/rest'" in capsys.readouterr().err
 
 

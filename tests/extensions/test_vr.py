@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.vr import foveation as measures
+from data_tools.claims.vr import queues
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -13,7 +16,7 @@ from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.vr import foveation, measures, queues
+from minisplat_ref.extensions.vr import foveation
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
 from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
 from minisplat_ref.extensions.vr.stages import stages
@@ -300,13 +303,13 @@ def test_trains_renders_and_studies(tmp_path, capsys):
     assert main(["vr", "render", ply, "--gaze", "10,12", "--full", "4", "--out", str(images)]) == 0
     assert len(list(images.glob("*.png"))) == 2 and "1 for 4 x 4" in capsys.readouterr().out
     study = ["--ply", ply, "--repeats", "1", "--out", str(tmp_path / "study")]
-    assert main(["study", "vr/foveation", str(scene), *study]) == 0
+    assert measure_claim(["vr/foveation", str(scene), *study]) == 0
     rows = json.loads((tmp_path / "study" / "result.json").read_text())["rows"]
     assert rows[0]["n_samples"] > rows[1]["n_samples"] and "weighted PSNR" in capsys.readouterr().out
     capsys.readouterr()
-    assert main(["study", "vr/queues", "--ply", ply, "--out", str(tmp_path / "queues")]) == 0
+    assert measure_claim(["vr/queues", "--ply", ply, "--out", str(tmp_path / "queues")]) == 0
     assert "| queues of 4 x 4, 2 x 2 and pixel" in capsys.readouterr().out
-    assert main(["study", "vr/yaw", "--ply", ply, "--steps", "2", "--out", str(tmp_path / "yaw")]) == 0
+    assert measure_claim(["vr/yaw", "--ply", ply, "--steps", "2", "--out", str(tmp_path / "yaw")]) == 0
 
 
 @pytest.mark.parametrize(

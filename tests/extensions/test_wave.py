@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from data_tools.claims.wave import measures as claims
+from data_tools.claims.wave.measures import facing, tilted
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.wave import blending, claims, encoding, windows
+from minisplat_ref.extensions.wave import blending, encoding, windows
 from minisplat_ref.extensions.wave.blending import Scene, front_to_back
-from minisplat_ref.extensions.wave.claims import facing, tilted
 from minisplat_ref.extensions.wave.kernels import sum_spectra
 from minisplat_ref.extensions.wave.placement import place, steepest_slope
 from minisplat_ref.extensions.wave.reference import Flats, spectra, spectrum, waves_of

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref.cli import main
 from minisplat_ref.extensions.wave import hologram_file
 from minisplat_ref.io import viewpoints
@@ -187,7 +188,7 @@ def test_a_file_that_is_no_hologram(hologram, run, tmp_path, capsys):
 
 
 def test_the_study_measures_its_claims(tmp_path, capsys):
-    assert main(["study", "wave/claims", "--gaussians", "4", "--out", str(tmp_path / "study")]) == 0
+    assert measure_claim(["wave/claims", "--gaussians", "4", "--out", str(tmp_path / "study")]) == 0
     result = json.loads((tmp_path / "study" / "result.json").read_text())
     cost, edge = result["cost"], result["edge"]
     assert (
@@ -200,7 +201,7 @@ def test_the_study_measures_its_claims(tmp_path, capsys):
 
 def test_a_trained_scene_is_best_where_it_is_in_focus(run, tmp_path, capsys):
     ply, out = run / "point_cloud.ply", tmp_path / "study"
-    assert main(["study", "wave/scene", str(ply), "--out", str(out)]) == 0
+    assert measure_claim(["wave/scene", str(ply), "--out", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
     thirds = result["thirds"]
     assert thirds["near"]["depth"] < thirds["middle"]["depth"] < thirds["far"]["depth"]

@@ -89,7 +89,7 @@ def short_run(folder, recipe="3dgs-accel", *options):
     return folder / "run"
 
 
-def refused_line(capfd, folder, *arguments):
+def refused_line(capfd, folder, *arguments, main=main):
     """The line in which a command refuses its arguments; the folder stays as it is."""
     capfd.readouterr()
     before = sorted(folder.rglob("*"))

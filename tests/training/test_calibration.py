@@ -8,6 +8,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
+from data_tools.claims import exposure as exposures_study
+from data_tools.claims import pose as poses_study
+from data_tools.claims.exposure import EXPOSURE
+from data_tools.claims.pose import POSE
 from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
@@ -15,9 +19,6 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.studies import EXPOSURE, POSE
-from minisplat_ref.studies import exposures as exposures_study
-from minisplat_ref.studies import poses as poses_study
 from minisplat_ref.training.calibration import (
     ANGLE_MIN,
     EXPOSURES,

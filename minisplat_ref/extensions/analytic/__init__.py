@@ -9,7 +9,7 @@ the integral over the square, in closed form, without a low-pass (:mod:`minispla
 with the offset u along the footprint's axes and its standard deviations l. F is the normal distribution function or, in
 the recipe as in the paper, ``1 / (1 + exp(-(1.6 x + 0.07 x^3)))``, which needs no error function. With the former the
 integral is exact where the axes are the image's. Elsewhere the square is rotated along with them, so needles at an
-angle have an error, which ``study analytic/footprint`` measures (``docs/FAMILY.md`` has the figures).
+angle have an error, which ``claims analytic/footprint`` measures (``docs/FAMILY.md`` has the figures).
 
 The integral is a response (:class:`minisplat_ref.reference.hits.Response`); the rest of the renderer is that of 3DGS,
 on the plain kernels or the reference. Only the reference collects blend statistics.
@@ -19,21 +19,12 @@ footprint is round, since it does not exist there, and the list of tiles is the 
 thresholds for the longest and thinnest footprints are replaced by bounds of the standard deviations.
 
     minisplat-ref train SCENE --recipe analytic
-    minisplat-ref study analytic/footprint --out DIR
+    python -m data_tools.claims analytic/footprint --out DIR
     minisplat-ref oracle gradients --extension analytic
 """
 
 from minisplat_ref.extensions.analytic.method import ANALYTIC, INTEGRATED
 from minisplat_ref.extensions.analytic.stages import stages
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.studies.study import OUT, declare, number, seed
 
-FOOTPRINT = declare(
-    "footprint",
-    "alpha of one Gaussian against its integral over pixels",
-    f"{__name__}.footprint.run",
-    OUT,
-    number("--places", 64, "positions within a pixel"),
-    seed("of positions and angles"),
-)
-EXTENSION = Extension("analytic", recipes=(ANALYTIC,), representation=INTEGRATED, stages=stages, studies=(FOOTPRINT,))
+EXTENSION = Extension("analytic", recipes=(ANALYTIC,), representation=INTEGRATED, stages=stages)

@@ -25,21 +25,12 @@ the place of s and o, a PLY of six fields.
 
     minisplat-ref train SCENE --recipe antialiasing --out runs/fine
     minisplat-ref antialiasing fuse runs/fine fine.ply
-    minisplat-ref study antialiasing/zoom SCENE --out DIR
+    python -m data_tools.claims antialiasing/zoom SCENE --out DIR
     minisplat-ref oracle gradients --extension antialiasing
 """
 
 from minisplat_ref.extensions.antialiasing import fuse
 from minisplat_ref.extensions.antialiasing.method import ANTIALIASING, FILTERED
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.studies.study import OUT, declare, downscale, iterations, scene, seeds
 
-ZOOM = declare(
-    "zoom",
-    "a scene seen from farther and nearer than in training",
-    f"{__name__}.zoom.run",
-    *(scene("room"), OUT, downscale(4), iterations(1000), seeds(2)),
-)
-EXTENSION = Extension(
-    "antialiasing", recipes=(ANTIALIASING,), representation=FILTERED, commands=(fuse,), studies=(ZOOM,)
-)
+EXTENSION = Extension("antialiasing", recipes=(ANTIALIASING,), representation=FILTERED, commands=(fuse,))

@@ -19,7 +19,7 @@ and ``.ksplat`` (:mod:`.ksplat`), which is only read.
 
     minisplat-ref convert runs/fox fox.msz --max-drop 0.1
     minisplat-ref convert fox.msz fox.ply
-    minisplat-ref study compression/rate-distortion SCENE --out DIR
+    python -m data_tools.claims compression/rate-distortion SCENE --out DIR
 
 The order of the Gaussians is not preserved; only ties in depth depend on it. Quaternions come back with another length,
 which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that draws
@@ -38,16 +38,6 @@ from minisplat_ref.extensions.compression.sog import SOG
 from minisplat_ref.extensions.compression.splat import SPLAT
 from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.studies.study import argument, declare, trainings
 
-RATE_DISTORTION = declare(
-    "rate-distortion",
-    "bytes against quality: .msz beside PLY, SPZ and SOG",
-    f"{__name__}.study.run",
-    *trainings(1000, "mini-splatting2"),
-    argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program"),
-)
-EXTENSION = Extension(
-    "compression", formats=(MSZ, SPZ, SPLAT, SOG, COMPRESSED_PLY, GLB, KSPLAT), studies=(RATE_DISTORTION,)
-)
-"""The formats of this project and of other programs, and a study."""
+EXTENSION = Extension("compression", formats=(MSZ, SPZ, SPLAT, SOG, COMPRESSED_PLY, GLB, KSPLAT))
+"""The formats of this project and of other programs."""

@@ -23,8 +23,8 @@ Anchors are those of Scaffold-GS (Lu et al. 2023, arXiv 2312.00109), whose rule 
     minisplat-ref train SCENE --recipe cus --set features=DIR --out runs/anchors
     minisplat-ref train SCENE --recipe cus --set growth_threshold=none --out runs/anchors
     minisplat-ref cus features runs/anchors --out maps
-    minisplat-ref study cus/floats --out DIR
-    minisplat-ref study cus/growth --out DIR
+    python -m data_tools.claims cus/floats --out DIR
+    python -m data_tools.claims cus/growth --out DIR
     minisplat-ref oracle gradients --extension cus
 
 ``features=DIR`` has a map for each photograph, ``NAME.npy`` or ``NAME.npz`` of [h, w, D], of whatever network; without
@@ -51,7 +51,6 @@ from minisplat_ref.extensions.cus.stages import stages
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.studies.study import RESUMED_OUT, declare, iterations, seeds
 
 
 def save(path: str | Path, gaussians: Any, label: Label) -> None:
@@ -59,18 +58,6 @@ def save(path: str | Path, gaussians: Any, label: Label) -> None:
     save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
 
 
-FLOATS = declare(
-    "floats",
-    "features from anchors against a query for each Gaussian, over floats",
-    f"{__name__}.study.run",
-    *(RESUMED_OUT, iterations(600), seeds(3)),
-)
-GROWTH = declare(
-    "growth",
-    "trainings with and without the growing of anchors",
-    f"{__name__}.growth_study.run",
-    *(RESUMED_OUT, iterations(2_000), seeds(3)),
-)
 EXTENSION = Extension(
     "cus",
     recipes=(CUS,),
@@ -78,6 +65,5 @@ EXTENSION = Extension(
     save=save,
     stages=stages,
     commands=(features,),
-    studies=(FLOATS, GROWTH),
 )
-"""The recipe ``cus`` with its renderer, a command and two studies."""
+"""The recipe ``cus`` with its renderer, and a command."""

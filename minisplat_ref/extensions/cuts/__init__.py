@@ -14,8 +14,8 @@ so what is saved, evaluated and rendered has hard edges. ``widths`` is a column 
 
     minisplat-ref train SCENE --recipe cuts
     minisplat-ref train SCENE --recipe cuts --set n_curves=2
-    minisplat-ref study cuts/card --out DIR
-    minisplat-ref study cuts/edge SCENE --out DIR
+    python -m data_tools.claims cuts/card --out DIR
+    python -m data_tools.claims cuts/edge SCENE --out DIR
     minisplat-ref oracle gradients --extension cuts
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -31,18 +31,5 @@ curves are seen edge on.
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS
 from minisplat_ref.extensions.cuts.stages import stages
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.studies.study import OUT, SCENE, declare, downscale, iterations, seeds
 
-CARD = declare(
-    "card",
-    "images with a sharp edge, by few Gaussians with and without cuts",
-    f"{__name__}.study.run",
-    *(OUT, iterations(300), seeds(4)),
-)
-EDGE = declare(
-    "edge",
-    "a real edge, in a window of a photograph, with no, one and two curves per Gaussian",
-    f"{__name__}.edge.run",
-    *(SCENE, downscale(), OUT, iterations(300), seeds(3)),
-)
-EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages, studies=(CARD, EDGE))
+EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages)

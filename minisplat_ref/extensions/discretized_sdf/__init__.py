@@ -17,8 +17,8 @@ Training begins with the foreground on a sphere; its stages of shading are those
     minisplat-ref train SCENE --recipe discretized-sdf --set foreground=1 --out runs/sdf
     minisplat-ref render runs/sdf --map normal
     minisplat-ref render runs/sdf --environment studio.png
-    minisplat-ref study discretized-sdf/sphere --out DIR
-    minisplat-ref study discretized-sdf/relight --out DIR
+    python -m data_tools.claims discretized-sdf/sphere --out DIR
+    python -m data_tools.claims discretized-sdf/relight --out DIR
     minisplat-ref oracle gradients --extension discretized-sdf
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -37,21 +37,6 @@ opacities.
 from minisplat_ref.extensions.discretized_sdf.method import DISTANCED, RECIPE
 from minisplat_ref.extensions.discretized_sdf.stages import stages
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.studies.study import OUT, declare, iterations, seeds
 
-SPHERE = declare(
-    "sphere",
-    "noisy surfels around a sphere: what projection does",
-    f"{__name__}.study.run_sphere",
-    *(OUT, seeds(3)),
-)
-RELIGHT = declare(
-    "relight",
-    "a glossy sphere relit, beside Ref-Gaussian",
-    f"{__name__}.study.run_relight",
-    *(OUT, iterations(2000), seeds(3)),
-)
-EXTENSION = Extension(
-    "discretized-sdf", recipes=(RECIPE,), representation=DISTANCED, stages=stages, studies=(SPHERE, RELIGHT)
-)
-"""Surfels with signed distances, the recipe that trains them, and two studies."""
+EXTENSION = Extension("discretized-sdf", recipes=(RECIPE,), representation=DISTANCED, stages=stages)
+"""Surfels with signed distances, the recipe that trains them."""

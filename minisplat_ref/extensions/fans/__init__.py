@@ -14,8 +14,8 @@ gradients, so that the position, colour and opacity of each vertex can be traine
     minisplat-ref fans fine-tune photos/fox runs/fox fans.ply
     minisplat-ref render fans.ply --cameras runs/fox/cameras.json
     minisplat-ref train SCENE --recipe fans --set is_flat=false
-    minisplat-ref study fans/profile --out DIR
-    minisplat-ref study fans/refit SCENE --out DIR
+    python -m data_tools.claims fans/profile --out DIR
+    python -m data_tools.claims fans/refit SCENE --out DIR
     minisplat-ref bench --extension fans
     minisplat-ref oracle gradients --extension fans
 
@@ -34,18 +34,7 @@ from minisplat_ref.extensions.fans import export, fine_tune
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans
 from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
 from minisplat_ref.extensions.fans.stages import stages
-from minisplat_ref.studies import study
 
-PROFILE = study.declare(
-    "profile", "which fan approximates a Gaussian best, from any side", f"{__name__}.study.run_profile", study.OUT
-)
-REFIT = study.declare(
-    "refit",
-    "what a scene loses as a mesh, and what refitting gives back",
-    f"{__name__}.study.run",
-    *study.trainings(1000, "mini-splatting"),
-    study.fine_tune(500),
-)
 EXTENSION = Extension(
     "fans",
     recipes=(FANS,),
@@ -54,5 +43,4 @@ EXTENSION = Extension(
     load=load_fans,
     commands=(export, fine_tune),
     stages=stages,
-    studies=(PROFILE, REFIT),
 )

@@ -4,10 +4,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from minisplat_ref.arguments import add_number
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.arguments import add_shape, load_as_fans, shape_of
 from minisplat_ref.progress import progress_bar
-from minisplat_ref.studies.study import downscale, iterations, seed
 
 EPILOG = """\
 example:
@@ -28,9 +28,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("scene", metavar="SCENE", help="folder of photographs that the model was trained on")
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians or of fans, or a run's folder")
     parser.add_argument("out", type=Path, metavar="OUT", help="PLY of fans to write")
-    downscale()(parser)
-    iterations(1000, "length")(parser)
-    seed("of the training")(parser)
+    add_number(parser, "--downscale", 1, "make photographs D times smaller", metavar="D")
+    add_number(parser, "--iterations", 1000, "length")
+    add_number(parser, "--seed", 0, "of the training", minimum=0, metavar="S")
     add_shape(parser)
     parser.set_defaults(run=run)
 
@@ -43,9 +43,9 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The scene, the model or the output cannot be used, or a number is out of range.
     """
+    from minisplat_ref.datasets.named_scenes import read_scene
     from minisplat_ref.extensions.fans.mesh_files import save_fans
     from minisplat_ref.extensions.fans.tuning import fine_tune, measure
-    from minisplat_ref.studies.kit import read_scene
 
     if args.out.suffix.lower() != ".ply":
         raise InputError(f"{args.out}: fine-tuned fans are written as a .ply, of which fans export makes other formats")

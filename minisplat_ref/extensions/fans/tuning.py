@@ -11,7 +11,7 @@ from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, FINE_TUNING
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians
 from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import RenderSettings, Request
-from minisplat_ref.studies import kit
+from minisplat_ref.training.fine_tuning import fine_tune as train_further
 from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.training.state import StepReport
@@ -27,7 +27,7 @@ def fine_tune(
 ) -> Fans:
     """Return fans after some iterations of ``FINE_TUNING`` of their vertices; the given ones are not changed."""
     recipe = scale_recipe(FINE_TUNING, iterations)._replace(representation=FANS_OF_GAUSSIANS)
-    result: Fans = kit.fine_tune(fans, scene, recipe, seed, on_step)
+    result: Fans = train_further(fans, scene, recipe, seed, on_step)
     return result
 
 

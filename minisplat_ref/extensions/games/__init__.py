@@ -8,7 +8,7 @@ axes are those of the face (:mod:`.faces` has the equations). Whatever moves the
     minisplat-ref mesh runs/fox --out fox.ply
     minisplat-ref train data/fox --recipe games --init fox.ply --set per_face=5 --out runs/on_mesh
     minisplat-ref proxies follow runs/on_mesh fox.ply bent.ply bent_model.ply
-    minisplat-ref study games/counts room --out DIR
+    python -m data_tools.claims games/counts room --out DIR
     minisplat-ref oracle gradients --extension games
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -26,14 +26,6 @@ Left out are corners that are trained, the soup of triangles for scenes without 
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.games.method import GAMES, ON_FACES
-from minisplat_ref.studies.study import OUT, argument, declare, iterations, seeds
 
-COUNTS = declare(
-    "counts",
-    "Gaussians on the faces of the exact mesh against free ones, at equal counts",
-    f"{__name__}.study.run",
-    argument("scene", metavar="SCENE", help="a synthetic one, such as room"),
-    *(OUT, iterations(2000), seeds(3)),
-)
-EXTENSION = Extension("games", recipes=(GAMES,), representation=ON_FACES, studies=(COUNTS,))
-"""Gaussians on faces, the recipe that trains them, and a study."""
+EXTENSION = Extension("games", recipes=(GAMES,), representation=ON_FACES)
+"""Gaussians on faces, the recipe that trains them."""

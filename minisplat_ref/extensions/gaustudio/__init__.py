@@ -17,8 +17,8 @@ place: a ball of K = 10,000 Gaussians on a Fibonacci lattice, white at first, or
     minisplat-ref gaustudio masks SCENE --out masks
     minisplat-ref train SCENE --recipe gaustudio --set sky_mask=from_files --set mask_folder=masks
     minisplat-ref mesh runs/studio --out mesh.ply --depth expected
-    minisplat-ref study gaustudio/sky SCENE --out DIR
-    minisplat-ref study gaustudio/swaps SCENE --out DIR
+    python -m data_tools.claims gaustudio/sky SCENE --out DIR
+    python -m data_tools.claims gaustudio/swaps SCENE --out DIR
     minisplat-ref oracle gradients --extension gaustudio
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -32,46 +32,15 @@ Meshes are fused by ``minisplat-ref mesh``, which does for any recipe what the p
 initialisers and depths that need a network, and the balls of several radii.
 """
 
-from minisplat_ref.arguments import list_of, name
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.gaustudio import masks, modules
 from minisplat_ref.extensions.gaustudio.method import RECIPE, STUDIO
 from minisplat_ref.extensions.gaustudio.stages import stages
-from minisplat_ref.studies.study import RESUMED_OUT, SCENE, SEEDS, argument, declare, downscale, iterations
 
-_MASKS = argument("--masks", metavar="DIR", help="masks of the sky, NAME.png each (default: by colour)")
-_COMMON = (SCENE, RESUMED_OUT, downscale(), iterations(2000), SEEDS, _MASKS)
-SKY = declare(
-    "sky",
-    "opacity in the sky with backgrounds and a loss, and without",
-    f"{__name__}.study.run_sky",
-    *_COMMON,
-    argument(
-        "--arms",
-        type=list_of(name),
-        default=("without", "ball", "ball+loss", "harmonics+loss", "map+loss"),
-        metavar="A,B",
-        help="of without, loss, ball, ball+loss, harmonics+loss, map+loss (default: all but loss)",
-    ),
-)
-SWAPS = declare(
-    "swaps",
-    "exchange one stage at a time",
-    f"{__name__}.study.run_swaps",
-    *_COMMON,
-    argument(
-        "--stages",
-        type=list_of(name),
-        default=("initialiser", "representation", "background", "photo_loss", "density"),
-        metavar="S,T",
-        help="which stages (default: all of initialiser, representation, background, photo_loss, density)",
-    ),
-)
 EXTENSION = Extension(
     "gaustudio",
     recipes=(RECIPE,),
     representation=STUDIO,
     commands=(modules, masks),
     stages=stages,
-    studies=(SKY, SWAPS),
 )

@@ -14,8 +14,8 @@ repulsive one, ``sum exp(-|x_i - x_j|^2 / 2 h^2)``, which does what the text say
 
     minisplat-ref train SCENE --recipe gdgs
     minisplat-ref train SCENE --recipe gdgs --set dispersion=0 --set contraction=0.001
-    minisplat-ref study gdgs/sphere
-    minisplat-ref study gdgs/counts SCENE --out DIR
+    python -m data_tools.claims gdgs/sphere
+    python -m data_tools.claims gdgs/counts SCENE --out DIR
     minisplat-ref oracle gradients --extension gdgs
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -29,19 +29,5 @@ factor.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.gdgs.method import GDGS, SURFACED
-from minisplat_ref.studies.study import RESUMED_OUT, declare, downscale, iterations, number, scene, seeds
 
-SPHERE = declare(
-    "sphere",
-    "noisy points of a sphere: distance, normals and spacing",
-    f"{__name__}.study.run",
-    number("--steps", 100, "of gradient descent"),
-    seeds(3),
-)
-COUNTS = declare(
-    "counts",
-    "detail at an equal number of Gaussians, beside 3DGS",
-    f"{__name__}.counts.run",
-    *(scene(), RESUMED_OUT, downscale(), iterations(2000), seeds(3)),
-)
-EXTENSION = Extension("gdgs", recipes=(GDGS,), representation=SURFACED, studies=(SPHERE, COUNTS))
+EXTENSION = Extension("gdgs", recipes=(GDGS,), representation=SURFACED)

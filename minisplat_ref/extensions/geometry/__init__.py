@@ -13,7 +13,7 @@ until it is set:
 All are functions of the expected depth ``sum w z / alpha``, so their gradient goes to the depth channel and to alpha.
 
     minisplat-ref train SCENE --extension geometry --set sfm_depth=0.1
-    minisplat-ref study geometry/depth room --out DIR
+    python -m data_tools.claims geometry/depth room --out DIR
     minisplat-ref oracle gradients --extension geometry
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -22,12 +22,5 @@ All are functions of the expected depth ``sum w z / alpha``, so their gradient g
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.geometry.losses import LOSSES
 from minisplat_ref.extensions.geometry.stages import stages
-from minisplat_ref.studies.study import OUT, declare, iterations, recipe, seeds, synthetic_scene
 
-DEPTH = declare(
-    "depth",
-    "what each loss does to the depth, and to the images",
-    f"{__name__}.study.run",
-    *(synthetic_scene(), OUT, recipe("3dgs-accel"), iterations(2000), seeds(3)),
-)
-EXTENSION = Extension("geometry", losses=LOSSES, stages=stages, studies=(DEPTH,))
+EXTENSION = Extension("geometry", losses=LOSSES, stages=stages)

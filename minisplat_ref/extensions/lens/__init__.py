@@ -22,33 +22,13 @@ pixel may be missed by all rays.
 
     minisplat-ref train SCENE --recipe lens
     minisplat-ref train SCENE --extension lens --recipe 3dgs
-    minisplat-ref study lens/footprints --out DIR
-    minisplat-ref study lens/fisheye --out DIR
+    python -m data_tools.claims lens/footprints --out DIR
+    python -m data_tools.claims lens/fisheye --out DIR
     minisplat-ref oracle gradients --extension lens
 """
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
 from minisplat_ref.extensions.lens.stages import stages
-from minisplat_ref.studies.study import OUT, RESUMED_OUT, declare, iterations, number, seed, seeds
 
-FOOTPRINTS = declare(
-    "footprints",
-    "EWA, UT and exact footprints off the axis of a lens",
-    f"{__name__}.footprints.run",
-    OUT,
-    number("--gaussians", 20, "number of Gaussians"),
-    seed("of the Gaussians"),
-)
-FISHEYE = declare(
-    "fisheye",
-    "a fisheye of 150 degrees as photographed and undistorted",
-    f"{__name__}.fisheye.run",
-    RESUMED_OUT,
-    number("--width", 160, "of the photographs, pixels; their height is 3/4 of it", minimum=16, metavar="W"),
-    iterations(1000),
-    seeds(3),
-)
-EXTENSION = Extension(
-    "lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages, studies=(FOOTPRINTS, FISHEYE)
-)
+EXTENSION = Extension("lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages)

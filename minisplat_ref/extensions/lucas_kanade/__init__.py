@@ -19,8 +19,8 @@ of given maps. The camera may move: x and x' are seen by their own cameras.
     minisplat-ref train SCENE --recipe lucas-kanade --out runs/moving
     minisplat-ref train SCENE --recipe lucas-kanade --set flows=DIR --set depths=DIR --set depth_order=0.1
     minisplat-ref render runs/moving --time 0.5
-    minisplat-ref study lucas-kanade/forms
-    minisplat-ref study lucas-kanade/body --out DIR
+    python -m data_tools.claims lucas-kanade/forms
+    python -m data_tools.claims lucas-kanade/body --out DIR
     minisplat-ref oracle gradients --extension lucas-kanade
 
 ``docs/FAMILY.md`` has the measured figures. A PLY has the Gaussians of time 0, which any viewer shows; the warp is in
@@ -35,21 +35,5 @@ motion, and the rotation of spherical harmonics with their Gaussian.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.lucas_kanade.method import LUCAS_KANADE, WARPED
 from minisplat_ref.extensions.lucas_kanade.stages import stages
-from minisplat_ref.studies.study import CONTINUES, RESUMED_OUT, SEEDS, declare, iterations, seeds
 
-FORMS = declare(
-    "forms",
-    "three forms of a velocity, and its integral, beside each other",
-    f"{__name__}.study.run_forms",
-    seeds(3),
-)
-BODY = declare(
-    "body",
-    "a turning, growing body with and without the flow loss",
-    f"{__name__}.study.run_body",
-    *(RESUMED_OUT, iterations(2000), SEEDS),
-    description=f"A body that turns and grows, with and without the flow loss. {CONTINUES}",
-)
-EXTENSION = Extension(
-    "lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages, studies=(FORMS, BODY)
-)
+EXTENSION = Extension("lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages)

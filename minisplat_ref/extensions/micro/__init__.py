@@ -25,28 +25,13 @@ tau, beta, how much is removed and the reach of merging are our choices, since t
 out is LPIPS in the loss, whose weights are not ours to ship.
 
     minisplat-ref train SCENE --recipe micro
-    minisplat-ref study micro/checker --out DIR
-    minisplat-ref study micro/counts SCENE --out DIR
+    python -m data_tools.claims micro/checker --out DIR
+    python -m data_tools.claims micro/counts SCENE --out DIR
     minisplat-ref oracle gradients --extension micro
 """
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.micro.method import MICRO
 from minisplat_ref.extensions.micro.stages import stages
-from minisplat_ref.studies.study import OUT, RESUMED_OUT, argument, declare, downscale, iterations, scene, seeds
 
-CHECKER = declare(
-    "checker",
-    "small Gaussians and detail at equal count, on edges and on a ramp",
-    f"{__name__}.checker.run",
-    *(OUT, iterations(1500, minimum=100), seeds(3)),
-    argument("--beta", type=float, default=1.0, metavar="B", help="weight of the detail (default 1)"),
-    argument("--trace", type=float, default=0.001, metavar="L", help="weight of the penalty (default 0.001)"),
-)
-COUNTS = declare(
-    "counts",
-    "quality against the number of Gaussians, with the second stage and without",
-    f"{__name__}.counts.run",
-    *(scene(), RESUMED_OUT, downscale(), iterations(2000), seeds(3)),
-)
-EXTENSION = Extension("micro", recipes=(MICRO,), stages=stages, studies=(CHECKER, COUNTS))
+EXTENSION = Extension("micro", recipes=(MICRO,), stages=stages)

@@ -21,13 +21,13 @@ It reconstructs surfaces, so the recipe has the losses of 2D Gaussian Splatting 
     minisplat-ref train SCENE --recipe mixed --out runs/mixed
     minisplat-ref train SCENE --recipe mixed --set distortion=100
     minisplat-ref mesh runs/mixed --out mesh.ply
-    minisplat-ref study mesh room --recipes mixed,mixed+normal_consistency=0 --out DIR
-    minisplat-ref study mixed/shapes --out DIR
-    minisplat-ref study mixed/letter --out DIR
-    minisplat-ref study mixed/scene SCENE room --iterations 300 --out DIR
+    python -m data_tools.claims mesh room --recipes mixed,mixed+normal_consistency=0 --out DIR
+    python -m data_tools.claims mixed/shapes --out DIR
+    python -m data_tools.claims mixed/letter --out DIR
+    python -m data_tools.claims mixed/scene SCENE room --iterations 300 --out DIR
     minisplat-ref oracle gradients --extension mixed
 
-:mod:`minisplat_ref.extensions.mixed.fit` fits an image with a few primitives of one kind. ``docs/FAMILY.md`` has the
+:mod:`data_tools.claims.mixed.fit` fits an image with a few primitives of one kind. ``docs/FAMILY.md`` has the
 measured figures.
 
 Built of the paper: the three primitives and their response, groups of points at the start, the loss of vertices, the
@@ -44,25 +44,11 @@ vertices, as in the paper, and size limits look at deviations alone.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.mixed.method import MIXED, MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.stages import of_all_kinds, stages
-from minisplat_ref.studies.study import OUT, argument, declare, downscale, iterations, seeds
 
-_FITS = (OUT, iterations(400, "of each training"), seeds(3))
-SHAPES = declare("shapes", "how many ellipses match a line or a triangle", f"{__name__}.study.run_shapes", *_FITS)
-LETTER = declare(
-    "letter", "a letter and a ring by few ellipses, lines or triangles", f"{__name__}.study.run_letter", *_FITS
-)
-SCENE = declare(
-    "scene",
-    "ellipses, lines and triangles against 3DGS of as many floats",
-    f"{__name__}.scene_study.run",
-    argument("scenes", nargs="+", metavar="SCENE", help="folders, or synthetic scenes such as room"),
-    *(downscale(4), iterations(400), seeds(2), OUT),
-)
 EXTENSION = Extension(
     "mixed",
     recipes=(MIXED,),
     representation=MIXED_GAUSSIANS,
     stages=stages,
     sample=of_all_kinds,
-    studies=(SHAPES, LETTER, SCENE),
 )

@@ -27,20 +27,11 @@ not.
     minisplat-ref train SCENE --recipe multi-scale
     minisplat-ref multi-scale build runs/SCENE/point_cloud.ply --out levels.ply
     minisplat-ref render levels.ply
-    minisplat-ref study multi-scale/downscale SCENE --out DIR
+    python -m data_tools.claims multi-scale/downscale SCENE --out DIR
 """
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.multi_scale import build
 from minisplat_ref.extensions.multi_scale.method import LEVELS, MULTI_SCALE
-from minisplat_ref.studies.study import OUT, declare, downscale, iterations, scene, seeds
 
-DOWNSCALE = declare(
-    "downscale",
-    "a trained scene in smaller images, with and without levels",
-    f"{__name__}.downscale.run",
-    *(scene("room"), OUT, downscale(), iterations(1000, minimum=10), seeds(2)),
-)
-EXTENSION = Extension(
-    "multi-scale", recipes=(MULTI_SCALE,), representation=LEVELS, commands=(build,), studies=(DOWNSCALE,)
-)
+EXTENSION = Extension("multi-scale", recipes=(MULTI_SCALE,), representation=LEVELS, commands=(build,))

@@ -18,7 +18,7 @@ as large as its spacing ``r = D / f * stride`` and turned to the normal
     minisplat-ref train SCENE --recipe mvg
     minisplat-ref train SCENE --recipe mvg --set n_sources=0
     minisplat-ref mesh RUN --out mesh.ply
-    minisplat-ref study mvg/insertion staircase --out DIR
+    python -m data_tools.claims mvg/insertion staircase --out DIR
     minisplat-ref oracle gradients --extension mvg
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -33,12 +33,5 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.mvg.method import MVG
 from minisplat_ref.extensions.mvg.stages import stages
 from minisplat_ref.mechanisms.surfels.discs import DISCS
-from minisplat_ref.studies.study import OUT, declare, number, seeds, synthetic_scene
 
-INSERTION = declare(
-    "insertion",
-    "wrong insertions, normals and completeness from faulty depth maps",
-    f"{__name__}.study.run",
-    *(synthetic_scene(), OUT, number("--views", 12, "of 240 x 180 pixels", minimum=3), seeds(3)),
-)
-EXTENSION = Extension("mvg", recipes=(MVG,), representation=DISCS, stages=stages, studies=(INSERTION,))
+EXTENSION = Extension("mvg", recipes=(MVG,), representation=DISCS, stages=stages)

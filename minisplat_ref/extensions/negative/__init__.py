@@ -17,8 +17,8 @@ of the Gaussians starts negative. Where all colours are positive the image is th
 Four consequences are worth knowing:
 
 - A negative Gaussian in front of others dims them like any other: it adds ``-w |c|`` and takes its part of the
-  transmittance. It cancels a *colour*, but makes no hole to see through. ``study negative/backdrop`` measures this;
-  ``study negative/rings`` measures when a difference saves more Gaussians than it costs.
+  transmittance. It cancels a *colour*, but makes no hole to see through. ``claims negative/backdrop`` measures this;
+  ``claims negative/rings`` measures when a difference saves more Gaussians than it costs.
 - The image may be below zero, too. What is written and evaluated is clipped to [0, 1]; the loss sees it unclipped, as
   3DGS's loss sees values above one, because a clipped pixel has no gradient.
 - Pruning considers opacity and size, never the colour, so a Gaussian whose colour is near zero, which may be about to
@@ -36,22 +36,6 @@ components pair up, or not, as the photographs require.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.negative.method import NEGATIVE, SIGNED
-from minisplat_ref.studies.study import OUT, declare, number, seed, seeds
 
-STARTS = "per fit; the best counts"
-STUDIES = (
-    declare(
-        "rings",
-        "one Gaussian minus another against 2 to 4 positive ones",
-        f"{__name__}.rings.run",
-        *(OUT, seeds(3), number("--starts", 16, STARTS)),
-    ),
-    declare(
-        "backdrop",
-        "the hole of a ring: negative colours do not open it",
-        f"{__name__}.backdrop.run",
-        *(OUT, seed("of the starts"), number("--starts", 4, STARTS)),
-    ),
-)
-EXTENSION = Extension("negative", recipes=(NEGATIVE,), representation=SIGNED, studies=STUDIES)
-"""Gaussians of either sign with their renderer, the recipe that trains them, and two studies."""
+EXTENSION = Extension("negative", recipes=(NEGATIVE,), representation=SIGNED)
+"""Gaussians of either sign with their renderer, the recipe that trains them."""

@@ -18,8 +18,8 @@ to any Gaussians (:mod:`minisplat_ref.extensions.omg.file`).
     minisplat-ref train SCENE --recipe omg --out runs/small
     minisplat-ref omg pack runs/small/checkpoint.npz --out small.omg
     minisplat-ref convert runs/other fitted.omg
-    minisplat-ref study omg/distinctiveness room --out DIR
-    minisplat-ref study omg/files room --out DIR
+    python -m data_tools.claims omg/distinctiveness room --out DIR
+    python -m data_tools.claims omg/files room --out DIR
 
 What networks and codes make is written into the six fields of 3DGS in every iteration, so ``point_cloud.ply`` is one
 that every viewer draws and every format can hold. ``docs/FAMILY.md`` has the measured figures.
@@ -32,8 +32,6 @@ Huffman coding and xz. The released code seems to use the sorting permutation wh
 same only if the rows are sorted already; here it is the inverse.
 """
 
-from pathlib import Path
-
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.omg import pack
 from minisplat_ref.extensions.omg.file import OMG_FILE
@@ -41,42 +39,7 @@ from minisplat_ref.extensions.omg.method import OMG
 from minisplat_ref.extensions.omg.population import load_plain, save_plain, with_features
 from minisplat_ref.extensions.omg.renderer import COMPACT
 from minisplat_ref.extensions.omg.stages import stages
-from minisplat_ref.studies.study import (
-    CONTINUES,
-    OUT,
-    PLY,
-    RESUMED_OUT,
-    SEEDS,
-    argument,
-    declare,
-    downscale,
-    fine_tune,
-    iterations,
-    recipe,
-    scene,
-    seeds,
-)
 
-DISTINCTIVENESS = declare(
-    "distinctiveness",
-    "which 50, 25 and 12.5 % of the Gaussians to keep",
-    f"{__name__}.study.run",
-    *(scene(), RESUMED_OUT, downscale(), recipe("mini-splatting2"), iterations(1000), PLY, SEEDS, fine_tune(200)),
-    description=f"Which 50, 25 and 12.5 % of the Gaussians to keep. {CONTINUES}",
-)
-FILES = declare(
-    "files",
-    "bytes and quality of the codes and networks, beside other files",
-    f"{__name__}.file_study.run",
-    *(scene(), OUT, downscale(), iterations(2000), seeds(3)),
-    argument(
-        "--checkpoints",
-        type=lambda text: [Path(part) for part in text.split(",")],
-        default=(),
-        metavar="A,B",
-        help="take these trainings of the recipe omg instead of training",
-    ),
-)
 EXTENSION = Extension(
     "omg",
     recipes=(OMG,),
@@ -88,6 +51,5 @@ EXTENSION = Extension(
     sample=with_features,
     commands=(pack,),
     formats=(OMG_FILE,),
-    studies=(DISTINCTIVENESS, FILES),
 )
-"""The recipe ``omg`` with its renderer, the format ``.omg``, a command and studies."""
+"""The recipe ``omg`` with its renderer, the format ``.omg``, and a command."""

@@ -13,7 +13,7 @@ that also trains:
 
 Both depend on rays alone, and so do culling by distance and the low-pass, so a camera that turns sees the same colours
 up to rounding. Sorting does not remove every jump: where two Gaussians interpenetrate, two hits of a pixel change
-places as the camera *moves*, pixel by pixel instead of all at once. ``study pixel-order/rotation`` measures both, and
+places as the camera *moves*, pixel by pixel instead of all at once. ``claims pixel-order/rotation`` measures both, and
 ``docs/FAMILY.md`` has the figures.
 
 This deviates from StopThePop, which sorts in a hierarchy of queues for tiles, blocks and pixels; here each pixel has
@@ -23,47 +23,18 @@ footprints.
 
     minisplat-ref train SCENE --recipe pixel-order
     minisplat-ref train SCENE --recipe pixel-order --set buffer_size=8
-    minisplat-ref study pixel-order/order --out DIR
+    python -m data_tools.claims pixel-order/order --out DIR
     minisplat-ref bench --extension pixel-order
     minisplat-ref oracle gradients --extension pixel-order
 """
 
-from pathlib import Path
-
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.pixel_order.method import ORDERED, PIXEL_ORDER
 from minisplat_ref.extensions.pixel_order.stages import stages
-from minisplat_ref.studies.study import OUT, Argument, argument, declare, number, seed
 
-
-def _cloud(n: int) -> tuple[Argument, ...]:
-    return (OUT, number("--gaussians", n, "number of Gaussians"), seed("of the Gaussians"))
-
-
-ROTATION = declare(
-    "rotation",
-    "colours of fixed rays while the camera turns and moves",
-    f"{__name__}.clouds.run_rotation",
-    *(*_cloud(100), number("--steps", 80, "steps of the yaw")),
-)
-PROJECTION = declare(
-    "projection",
-    "footprints against the peak along rays, off the axis",
-    f"{__name__}.clouds.run_projection",
-    *_cloud(20),
-)
-ORDER = declare(
-    "order",
-    "hits out of order in a list and in buffers",
-    f"{__name__}.clouds.run_order",
-    *_cloud(300),
-    argument("--ply", type=Path, metavar="FILE", help="use the PLY of a run, seen by its first test camera"),
-    number("--every", 4, "N-th pixels along both axes"),
-)
 EXTENSION = Extension(
     "pixel-order",
     recipes=(PIXEL_ORDER,),
     representation=ORDERED,
     stages=stages,
-    studies=(ROTATION, PROJECTION, ORDER),
 )

@@ -19,10 +19,10 @@ A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The cor
 spans, whose ellipse is the Gaussian. Every affine edit is carried exactly.
 
 This deviates from the paper, which recovers a Gaussian from three vertices by Gram-Schmidt and so loses shear; here all
-corners are fitted, and the study measures the paper's way beside it. A ray has any number of hits, sorted exactly. The
-thickness is 1e-5 where training starts and has no effect on an image; it keeps its ratio under an edit. A Gaussian is
-flattened along whichever axis is its thinnest. Training starts from balls, whose planes are chosen at random; its loss
-and schedule are those of 3DGS. Hits of alpha below ``alpha_min`` = 1/255 do not count.
+corners are fitted, and ``claims polygons/edits`` measures the paper's way beside it. A ray has any number of hits,
+sorted exactly. The thickness is 1e-5 where training starts and has no effect on an image; it keeps its ratio under an
+edit. A Gaussian is flattened along whichever axis is its thinnest. Training starts from balls, whose planes are chosen
+at random; its loss and schedule are those of 3DGS. Hits of alpha below ``alpha_min`` = 1/255 do not count.
 
 The edge of a polygon has no gradient; it cuts less than 0.008 of alpha. There is no low-pass: Gaussians thinner than a
 pixel fall between rays. A polygon in a plane with the camera is not seen. Of polygons that lie in one
@@ -33,8 +33,8 @@ plane, copies are taken in the order of their rows, and others in the order in w
     minisplat-ref train SCENE --recipe polygons
     minisplat-ref polygons export runs/fox --out soup.ply
     minisplat-ref polygons edit runs/fox soup.ply --out edited.ply
-    minisplat-ref study polygons/edits --out DIR
-    minisplat-ref study polygons/cost
+    python -m data_tools.claims polygons/edits --out DIR
+    python -m data_tools.claims polygons/cost
     minisplat-ref oracle gradients --extension polygons
 """
 
@@ -42,26 +42,12 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.polygons import edit, export
 from minisplat_ref.extensions.polygons.method import POLYGONS, TRACED
 from minisplat_ref.extensions.polygons.stages import stages
-from minisplat_ref.studies.study import OUT, declare, number, seeds
 
-EDITS = declare(
-    "edits",
-    "polygons to Gaussians and back, affine edits, a bent sheet",
-    f"{__name__}.claims.run",
-    *(OUT, seeds(3)),
-)
-COST = declare(
-    "cost",
-    "a pixel of polygons beside one of ellipsoids on rays and of splats",
-    f"{__name__}.cost.run",
-    *(number("--gaussians", 10_000, "number"), number("--repeats", 5, "timings; the least counts")),
-)
 EXTENSION = Extension(
     "polygons",
     recipes=(POLYGONS,),
     representation=TRACED,
     commands=(export, edit),
     stages=stages,
-    studies=(EDITS, COST),
 )
-"""Flat Gaussians in polygons, the recipe that trains them, two commands that edit them, and two studies."""
+"""Flat Gaussians in polygons, the recipe that trains them, two commands that edit them."""

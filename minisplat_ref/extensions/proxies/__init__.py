@@ -24,15 +24,5 @@ what was rotated. ``docs/FAMILY.md`` has the measured figures.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.proxies import cage, edit, fall, follow
-from minisplat_ref.studies.study import OUT, declare, seed, seeds
 
-AFFINE = declare(
-    "affine", "edits against affine maps, and a rolled sheet", f"{__name__}.edit_claims.run", OUT, seeds(3)
-)
-SHEET = declare(
-    "sheet",
-    "shape and energy of a sheet that falls, hangs and swings",
-    f"{__name__}.sheet_claims.run",
-    *(OUT, seed("of the carpet's Gaussians")),
-)
-EXTENSION = Extension("proxies", commands=(edit, cage, follow, fall), studies=(AFFINE, SHEET))
+EXTENSION = Extension("proxies", commands=(edit, cage, follow, fall))

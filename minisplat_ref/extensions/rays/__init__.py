@@ -24,8 +24,8 @@ alias. Shadows, mirrors and glass have no gradient. ``docs/FAMILY.md`` has the m
 
     minisplat-ref train SCENE --recipe rays
     minisplat-ref rays render runs/fox --scene lamp_and_mirror.json --out DIR
-    minisplat-ref study rays/claims --out DIR
-    minisplat-ref study rays/speed
+    python -m data_tools.claims rays/claims --out DIR
+    python -m data_tools.claims rays/speed
     minisplat-ref oracle gradients --extension rays
 """
 
@@ -33,21 +33,6 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.rays import render
 from minisplat_ref.extensions.rays.method import RAYS, TRACED
 from minisplat_ref.extensions.rays.stages import stages
-from minisplat_ref.studies.study import OUT, declare, number, seed
 
-CLAIMS = declare(
-    "claims",
-    "tracing against exact order, mirrors, shadows and splatting",
-    f"{__name__}.claims.run_claims",
-    *(OUT, number("--gaussians", 300, "Gaussians per scene"), seed("of the scenes")),
-)
-SPEED = declare(
-    "speed",
-    "time of a ray and of a rasterised pixel",
-    f"{__name__}.claims.run_speed",
-    *(number("--gaussians", 10_000, "number"), number("--repeats", 5, "timings; the least counts")),
-)
-EXTENSION = Extension(
-    "rays", recipes=(RAYS,), representation=TRACED, commands=(render,), stages=stages, studies=(CLAIMS, SPEED)
-)
-"""Ray-traced Gaussians, the recipe that trains them, a command that lights them, and two studies."""
+EXTENSION = Extension("rays", recipes=(RAYS,), representation=TRACED, commands=(render,), stages=stages)
+"""Ray-traced Gaussians, the recipe that trains them, a command that lights them."""

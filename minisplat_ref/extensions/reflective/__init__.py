@@ -20,7 +20,7 @@ mirrors spread (:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on n
     minisplat-ref train SCENE --recipe reflective --out runs/reflective
     minisplat-ref render runs/reflective --map normal
     minisplat-ref render runs/reflective --environment studio.png
-    minisplat-ref study reflective/mirrors --out DIR
+    python -m data_tools.claims reflective/mirrors --out DIR
     minisplat-ref oracle gradients --extension reflective
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -35,13 +35,6 @@ environment as the background of the image.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.reflective.method import RECIPE, SHADED
 from minisplat_ref.extensions.reflective.stages import stages
-from minisplat_ref.studies.study import OUT, declare, seeds
 
-MIRRORS = declare(
-    "mirrors",
-    "what a mirror needs: shading per pixel, light, occlusion",
-    f"{__name__}.study.run",
-    *(OUT, seeds(3)),
-)
-EXTENSION = Extension("reflective", recipes=(RECIPE,), representation=SHADED, stages=stages, studies=(MIRRORS,))
-"""Surfels with materials, the recipe that trains them, and a study."""
+EXTENSION = Extension("reflective", recipes=(RECIPE,), representation=SHADED, stages=stages)
+"""Surfels with materials, the recipe that trains them."""

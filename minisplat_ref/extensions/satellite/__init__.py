@@ -16,8 +16,8 @@ renders.
 
     minisplat-ref satellite train IMAGES --altitudes 0,80 --out RUN
     minisplat-ref satellite dsm RUN --out dsm.npy
-    minisplat-ref study satellite/boxes --out DIR
-    minisplat-ref study satellite/distance --out DIR
+    python -m data_tools.claims satellite/boxes --out DIR
+    python -m data_tools.claims satellite/distance --out DIR
     minisplat-ref oracle gradients --extension satellite
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -35,20 +35,11 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.satellite import surface_model, training
 from minisplat_ref.extensions.satellite.method import RECIPE, SEEN_FROM_ABOVE
 from minisplat_ref.extensions.satellite.stages import stages
-from minisplat_ref.studies.study import OUT, RESUMED_OUT, declare, iterations, seeds
 
-BOXES = declare(
-    "boxes",
-    "heights, shadows and colours of boxes without each part",
-    f"{__name__}.claims.run_boxes",
-    *(RESUMED_OUT, seeds(3), iterations(2_000)),
-)
-DISTANCE = declare("distance", "from where affine cameras fit perspective ones", f"{__name__}.claims.run_distance", OUT)
 EXTENSION = Extension(
     "satellite",
     recipes=(RECIPE,),
     representation=SEEN_FROM_ABOVE,
     commands=(training, surface_model),
     stages=stages,
-    studies=(BOXES, DISTANCE),
 )

@@ -13,7 +13,7 @@ program may have made; nothing that was learned is downloaded.
     minisplat-ref segment label runs/fox --masks masks --out labelled.ply
     minisplat-ref segment label runs/fox --masks masks --extract 1 --out head.ply
     minisplat-ref segment render labelled.ply --cameras runs/fox/cameras.json --out labels
-    minisplat-ref study segment/masks --out DIR
+    python -m data_tools.claims segment/masks --out DIR
 
 ``docs/FAMILY.md`` has the measured figures.
 
@@ -30,13 +30,6 @@ Left out is what makes masks: there is no tracker and no network here.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.segment import label, render
-from minisplat_ref.studies.study import OUT, declare, iterations, seeds
 
-MASKS = declare(
-    "masks",
-    "labels at held-out views, from clean, shifted and lost masks, over the bias",
-    f"{__name__}.study.run",
-    *(OUT, iterations(1000), seeds(3)),
-)
-EXTENSION = Extension("segment", commands=(label, render), studies=(MASKS,))
-"""Two commands and a study."""
+EXTENSION = Extension("segment", commands=(label, render))
+"""Two commands."""

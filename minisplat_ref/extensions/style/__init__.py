@@ -18,7 +18,7 @@ The features F are those of a classical bank of filters, or of a network whose w
 (:mod:`minisplat_ref.mechanisms.features`).
 
     minisplat-ref style transfer RUN IMAGE --out NEW
-    minisplat-ref study style/swatches --out DIR
+    python -m data_tools.claims style/swatches --out DIR
     minisplat-ref oracle gradients --extension style
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -34,15 +34,5 @@ weights are not ours to ship.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.style import transfer
 from minisplat_ref.extensions.style.stages import stages
-from minisplat_ref.studies.study import RESUMED_OUT, declare, iterations, number, seeds
 
-SWATCHES = declare(
-    "swatches",
-    "two patterns on a room: features, splitting, and whether views agree",
-    f"{__name__}.study.run",
-    RESUMED_OUT,
-    number("--training", 1000, "iterations of the training"),
-    iterations(500, "of each stage of the styling"),
-    seeds(3),
-)
-EXTENSION = Extension("style", commands=(transfer,), stages=stages, studies=(SWATCHES,))
+EXTENSION = Extension("style", commands=(transfer,), stages=stages)

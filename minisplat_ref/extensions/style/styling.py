@@ -21,7 +21,7 @@ from minisplat_ref.extensions.style.reference import ColorMap, FeatureWeights, m
 from minisplat_ref.io.images import composite_alpha, read_image, resize_image
 from minisplat_ref.mechanisms.features.bank import FeatureBank, check_size
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
-from minisplat_ref.studies.kit import fine_tune
+from minisplat_ref.training.fine_tuning import fine_tune
 from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.types import Floats, Gaussians, Scene, View
 

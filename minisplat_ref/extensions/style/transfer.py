@@ -4,10 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.arguments import integer
+from minisplat_ref.arguments import add_number, integer
 from minisplat_ref.errors import InputError
 from minisplat_ref.progress import progress_bar
-from minisplat_ref.studies.study import iterations, seed
 
 DESCRIPTION = """\
 Paint a trained scene in the style of an image. First the photographs get the
@@ -39,7 +38,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="the --out folder of a training")
     parser.add_argument("image", type=Path, metavar="IMAGE", help="the style")
     parser.add_argument("--out", type=Path, required=True, metavar="NEW", help="new folder for the painted scene")
-    iterations(1000, "of each of the two stages")(parser)
+    add_number(parser, "--iterations", 1000, "of each of the two stages")
     parser.add_argument(
         "--strength",
         type=integer(1),
@@ -49,7 +48,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--weights", type=Path, metavar="NPZ", help="features of a network of your own")
     parser.add_argument("--scene", type=Path, metavar="PATH", help="where the photographs are now, if they have moved")
-    seed("of the trainings")(parser)
+    add_number(parser, "--seed", 0, "of the trainings", minimum=0, metavar="S")
     parser.set_defaults(run=run)
 
 

@@ -16,7 +16,7 @@ the published dates (:mod:`minisplat_ref.mechanisms.surfels.losses`):
 
     minisplat-ref train SCENE --recipe surfels --out runs/surfels
     minisplat-ref mesh runs/surfels --out mesh.ply
-    minisplat-ref study surfels/losses room --out DIR
+    python -m data_tools.claims surfels/losses room --out DIR
     minisplat-ref oracle gradients --extension surfels
     minisplat-ref oracle compare my_module:rasterization_2dgs --call rasterization_2dgs
 
@@ -31,12 +31,5 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.surfels.method import RECIPE
 from minisplat_ref.extensions.surfels.stages import stages
 from minisplat_ref.mechanisms.surfels.discs import DISCS
-from minisplat_ref.studies.study import OUT, declare, iterations, seeds, synthetic_scene
 
-LOSSES = declare(
-    "losses",
-    "what the losses of surfels do to depths, normals and images",
-    f"{__name__}.study.run",
-    *(synthetic_scene(), OUT, iterations(2000), seeds(3)),
-)
-EXTENSION = Extension("surfels", recipes=(RECIPE,), representation=DISCS, stages=stages, studies=(LOSSES,))
+EXTENSION = Extension("surfels", recipes=(RECIPE,), representation=DISCS, stages=stages)

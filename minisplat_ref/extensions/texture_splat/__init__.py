@@ -15,7 +15,7 @@ linear least-squares problem (:mod:`.baking`).
     minisplat-ref train SCENE --recipe reflective --out runs/reflective
     minisplat-ref train SCENE --recipe texture-splat --init runs/reflective --set texels=4 --out runs/textured
     minisplat-ref render runs/textured --map normal
-    minisplat-ref study texture-splat/bricks --out DIR
+    python -m data_tools.claims texture-splat/bricks --out DIR
     minisplat-ref oracle gradients --extension texture-splat
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -29,20 +29,12 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.texture_splat.file import load
 from minisplat_ref.extensions.texture_splat.method import RECIPE, TEXTURED_SURFELS
 from minisplat_ref.extensions.texture_splat.stages import stages
-from minisplat_ref.studies.study import OUT, declare, seeds
 
-BRICKS = declare(
-    "bricks",
-    "a brick wall: more texels beside more surfels, with as many floats",
-    f"{__name__}.study.run",
-    *(OUT, seeds(3)),
-)
 EXTENSION = Extension(
     "texture-splat",
     recipes=(RECIPE,),
     representation=TEXTURED_SURFELS,
     load=load,
     stages=stages,
-    studies=(BRICKS,),
 )
-"""Surfels with textures, the recipe that trains them after others, and a study."""
+"""Surfels with textures, the recipe that trains them after others."""

@@ -14,8 +14,8 @@ textures of degree 0 the method is 3DGS, to the last byte.
     minisplat-ref train SCENE --recipe mini-splatting --out runs/few
     minisplat-ref textured fine-tune SCENE runs/few/point_cloud.ply --out textured.ply
     minisplat-ref render textured.ply --cameras runs/few/cameras.json
-    minisplat-ref study textured/counts SCENE --out DIR
-    minisplat-ref study textured/limb
+    python -m data_tools.claims textured/counts SCENE --out DIR
+    python -m data_tools.claims textured/limb
     minisplat-ref oracle gradients --extension textured
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -32,22 +32,11 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.textured import fine_tune
 from minisplat_ref.extensions.textured.method import TEXTURED, TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.stages import stages
-from minisplat_ref.studies import study
 
-COUNTS = study.declare(
-    "counts",
-    "textures at equal numbers of Gaussians, and of floats",
-    f"{__name__}.study.run",
-    *study.trainings(1000, "mini-splatting"),
-    study.fine_tune(500),
-    study.argument("--frozen", action="store_true", help="train no positions and shapes"),
-)
-LIMB = study.declare("limb", "whether a texture jumps where rays begin to miss", f"{__name__}.study.run_limb")
 EXTENSION = Extension(
     "textured",
     recipes=(TEXTURED,),
     representation=TEXTURED_GAUSSIANS,
     commands=(fine_tune,),
     stages=stages,
-    studies=(COUNTS, LIMB),
 )

@@ -4,12 +4,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from minisplat_ref.arguments import add_number
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.textured.population import DEGREE
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.progress import progress_bar
-from minisplat_ref.studies.study import downscale, iterations, seed
 
 
 def add_parser(commands: Any) -> None:
@@ -22,8 +22,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("scene", metavar="SCENE", help="folder that the run was trained on")
     parser.add_argument("ply", type=Path, metavar="PLY", help="its point_cloud.ply; the paper uses Mini-Splatting")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
-    downscale()(parser)
-    iterations(1000, "length")(parser)
+    add_number(parser, "--downscale", 1, "make photographs D times smaller", metavar="D")
+    add_number(parser, "--iterations", 1000, "length")
     parser.add_argument(
         "--degree", type=int, default=DEGREE, metavar="L", help="degree of textures, 1 to 3 (default 3)"
     )
@@ -31,7 +31,7 @@ def add_parser(commands: Any) -> None:
         "--replace", action="store_true", help="replace the view-dependent colour by textures, as in the paper"
     )
     parser.add_argument("--frozen", action="store_true", help="train no positions and shapes, as the paper's text says")
-    seed("of the training")(parser)
+    add_number(parser, "--seed", 0, "of the training", minimum=0, metavar="S")
     parser.set_defaults(run=run)
 
 
@@ -43,8 +43,9 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The scene, the PLY or the output cannot be used, or a number is out of range.
     """
+    from minisplat_ref.datasets.named_scenes import read_scene
     from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
-    from minisplat_ref.studies.kit import floats_of, read_scene
+    from minisplat_ref.training.representation import floats_of
 
     if not 1 <= args.degree <= DEGREE:
         raise InputError(f"--degree is {args.degree}: give 1, 2 or 3")

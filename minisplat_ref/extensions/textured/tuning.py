@@ -7,7 +7,7 @@ from minisplat_ref.extensions.textured.method import FINE_TUNING, FROZEN, TEXTUR
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.studies import kit
+from minisplat_ref.training.fine_tuning import fine_tune as train_further
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.training.state import StepReport
@@ -49,7 +49,7 @@ def fine_tune(
         Called after each iteration.
     """
     recipe = scale_recipe(FROZEN if is_frozen else FINE_TUNING, iterations)
-    return kit.fine_tune(
+    return train_further(
         population, scene, recipe._replace(representation=representation_of(population)), seed, on_step
     )
 

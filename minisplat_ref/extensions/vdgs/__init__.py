@@ -13,8 +13,8 @@ published modes, ``both_times`` and ``both_plus`` change opacity and colour (:mo
 
     minisplat-ref train SCENE --recipe vdgs --set modulation=colors_plus --out runs/glossy
     minisplat-ref vdgs bake runs/glossy --view 0003 --out seen.ply
-    minisplat-ref study vdgs/pane --out DIR
-    minisplat-ref study vdgs/floats fox --downscale 2 --out DIR
+    python -m data_tools.claims vdgs/pane --out DIR
+    python -m data_tools.claims vdgs/floats fox --downscale 2 --out DIR
     minisplat-ref oracle gradients --extension vdgs
 
 A run keeps the network in ``shared.npz``. A PLY does not hold it, and says so: drawn without the run, the Gaussians are
@@ -35,7 +35,6 @@ from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
 from minisplat_ref.extensions.vdgs.stages import stages
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.studies.study import OUT, RESUMED_OUT, declare, downscale, iterations, number, scene, seeds
 
 
 def save(path: str | Path, gaussians: Any, label: Label) -> None:
@@ -43,19 +42,6 @@ def save(path: str | Path, gaussians: Any, label: Label) -> None:
     save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
 
 
-PANE = declare(
-    "pane",
-    "a pane whose opacity follows Schlick's formula: learned against true",
-    f"{__name__}.study.run",
-    *(OUT, iterations(600), seeds(3)),
-)
-FLOATS = declare(
-    "floats",
-    "held-out PSNR of four modes with as many floats as harmonics alone",
-    f"{__name__}.floats_study.run",
-    *(scene(), RESUMED_OUT, downscale(), iterations(1000), seeds(3)),
-    number("--gaussians", 10_000, "of harmonics alone, at most one for each point"),
-)
 EXTENSION = Extension(
     "vdgs",
     recipes=(VDGS,),
@@ -63,6 +49,5 @@ EXTENSION = Extension(
     save=save,
     commands=(bake,),
     stages=stages,
-    studies=(PANE, FLOATS),
 )
-"""The recipe ``vdgs`` with its renderer, a command and studies."""
+"""The recipe ``vdgs`` with its renderer, and a command."""

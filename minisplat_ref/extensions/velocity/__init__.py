@@ -1,7 +1,7 @@
 """Linear motion: every Gaussian has a velocity, and a view shows the scene at its time.
 
-This is the smallest extension that is a method. It has one more field, a renderer that wraps that of 3DGS, a recipe, a
-command and a study, and it is the worked example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t of a
+This is the smallest extension that is a method. It has one more field, a renderer that wraps that of 3DGS, a recipe
+and a command, and it is the worked example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t of a
 view is
 
     mu(t) = mu + t nu
@@ -21,12 +21,5 @@ followed; linear motion is the first-order case of all of them.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.velocity import freeze
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY
-from minisplat_ref.studies.study import declare, iterations, seed
 
-MOTION = declare(
-    "motion",
-    "find the velocities of a scene whose Gaussians are known",
-    f"{__name__}.study.run",
-    *(iterations(600), seed("of scene and trainings")),
-)
-EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING, commands=(freeze,), studies=(MOTION,))
+EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING, commands=(freeze,))

@@ -11,51 +11,28 @@ changes no number of Gaussians; ``vr`` is Mini-Splatting2 with them from the sta
     minisplat-ref train SCENE --recipe vr-fine-tuning --init runs/few --iterations 5000 --out runs/vr
     minisplat-ref train SCENE --recipe vr --out runs/whole
     minisplat-ref vr render runs/vr/point_cloud.ply --gaze 320,240 --out images
-    minisplat-ref study vr/foveation SCENE --ply runs/vr/point_cloud.ply --out DIR
-    minisplat-ref study vr/queues --ply runs/vr/point_cloud.ply --out DIR
-    minisplat-ref study vr/yaw --ply runs/vr/point_cloud.ply --out DIR
+    python -m data_tools.claims vr/foveation SCENE --ply runs/vr/point_cloud.ply --out DIR
+    python -m data_tools.claims vr/queues --ply runs/vr/point_cloud.ply --out DIR
+    python -m data_tools.claims vr/yaw --ply runs/vr/point_cloud.ply --out DIR
 
 ``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper. One buffer of 16 hits replaces StopThePop's queues of tiles, blocks and pixels, with which
-:mod:`minisplat_ref.extensions.vr.queues` compares it. We did not find figures of the paper's rates by eccentricity;
+:mod:`data_tools.claims.vr.queues` compares it. We did not find figures of the paper's rates by eccentricity;
 here there are three zones, whose ends follow an acuity that is linear in the eccentricity. Importance, surfaces and
 median depths of ``vr`` are those of its own footprints in each pixel's order. Frame rates, which are a GPU's, are left
 out; work is counted in rays, tiles and pairs. The user study cannot be repeated.
 """
 
-from pathlib import Path
-
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.vr import render
 from minisplat_ref.extensions.vr.method import HEADSET, VR, VR_FINE_TUNING
 from minisplat_ref.extensions.vr.stages import stages
-from minisplat_ref.studies.study import OUT, SCENE, argument, declare, downscale, number
 
-PLY = argument("--ply", type=Path, required=True, metavar="FILE", help="point_cloud.ply of a run")
-FOVEATION = declare(
-    "foveation",
-    "work against PSNR with fewer rays away from the gaze",
-    f"{__name__}.measures.run_foveation",
-    *(SCENE, PLY, downscale(), number("--repeats", 3, "timings per image"), OUT),
-)
-YAW = declare(
-    "yaw",
-    "colours of fixed rays through a trained scene while the camera turns",
-    f"{__name__}.measures.run_yaw",
-    *(PLY, number("--steps", 40, "steps of a yaw of +-10 degrees"), OUT),
-)
-QUEUES = declare(
-    "queues",
-    "hits in the wrong order, and the work: lists, a hierarchy of queues, buffers, exact order",
-    f"{__name__}.measures.run_queues",
-    *(PLY, OUT),
-)
 EXTENSION = Extension(
     "vr",
     recipes=(VR, VR_FINE_TUNING),
     representation=HEADSET,
     commands=(render,),
     stages=stages,
-    studies=(FOVEATION, QUEUES, YAW),
 )

@@ -47,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.names import file_names
     from minisplat_ref.io.ply import read_label
     from minisplat_ref.io.run_files import read_cameras
+    from minisplat_ref.progress import with_progress
     from minisplat_ref.rendering import Request
     from minisplat_ref.reporting import markdown_table
-    from minisplat_ref.studies.kit import with_progress
     from minisplat_ref.types import Model
 
     x, y = args.gaze

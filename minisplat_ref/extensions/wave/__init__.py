@@ -17,8 +17,8 @@ method as a baseline. A display that shows phases alone gets the double-phase en
 
     minisplat-ref wave hologram runs/fox --out fox.npz --phase fox_phase.png
     minisplat-ref wave focus fox.npz --depth 5 --out near.png
-    minisplat-ref study wave/claims --out DIR
-    minisplat-ref study wave/scene runs/fox/point_cloud.ply --out DIR
+    python -m data_tools.claims wave/claims --out DIR
+    python -m data_tools.claims wave/scene runs/fox/point_cloud.ply --out DIR
     minisplat-ref oracle gradients --extension wave
 
 ``docs/FAMILY.md`` has the measured figures.
@@ -38,25 +38,9 @@ Left out: training on holograms, random phases (they blur what is out of focus m
 comparison by photographs of a display. There is nothing to train, so the gradients are those of the closed form.
 """
 
-from pathlib import Path
-
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.wave import focus, hologram
 from minisplat_ref.extensions.wave.stages import stages
-from minisplat_ref.studies.study import OUT, argument, declare, number
 
-CLAIMS = declare(
-    "claims",
-    "closed form, focus, occlusion and cost of waves",
-    f"{__name__}.claims.run",
-    *(OUT, number("--gaussians", 200, "whose cost is measured")),
-)
-SCENE = declare(
-    "scene",
-    "holograms of a trained scene against its rendering",
-    f"{__name__}.scene_study.run",
-    argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run, which has test views"),
-    OUT,
-)
-EXTENSION = Extension("wave", commands=(hologram, focus), stages=stages, studies=(CLAIMS, SCENE))
-"""Two commands, the closed form's gradients, and studies of the paper's claims and of a trained scene."""
+EXTENSION = Extension("wave", commands=(hologram, focus), stages=stages)
+"""Two commands, the closed form's gradients."""

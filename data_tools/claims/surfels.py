@@ -1,0 +1,108 @@
+"""The study ``surfels/losses``: what the two losses do to depths, normals and images, beside 3D Gaussians.
+
+A synthetic scene is trained by ``3dgs-accel`` and by ``surfels`` without the losses, with each, and with both. On test
+views the expected depth is compared with the ray tracer's where the image is opaque, and the normals of the surface
+through it with the true ones.
+"""
+
+import argparse
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from data_tools.claims import kit
+from data_tools.claims.kit.claim import OUT, declare, iterations, seeds, synthetic_scene
+from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
+from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.mechanisms.depth_maps.normals import central_normals
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.reference.depth import expected_depth
+from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY
+from minisplat_ref.training.schedule import configure
+
+GAUSSIANS = "3dgs-accel"
+ARMS: dict[str, dict[str, float]] = {
+    GAUSSIANS: {},
+    "surfels without": {"normal_consistency": 0.0},
+    "normal_consistency": {},
+    "distortion": {"normal_consistency": 0.0, "distortion": 100.0},
+    "both": {"distortion": 100.0},
+}
+"""Settings by name; the weights are the released ones."""
+ALPHA_MIN = 0.5
+MEASURES = {"depth_error": 2, "normal_error": 1, "psnr": 2, "n_gaussians": 0}
+"""Columns, with their digits."""
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train every arm with every seed, and measure."""
+    made = make_scene(args.scene)
+    records = [
+        {"arm": arm, "seed": seed, **outcome(made, arm, args.iterations, seed)}
+        for arm in kit.with_progress(ARMS, "arms")
+        for seed in range(args.seeds)
+    ]
+    description = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations", "seeds")}
+    rows = [
+        [arm, *(with_deviation([r[key] for r in records if r["arm"] == arm], d) for key, d in MEASURES.items())]
+        for arm in ARMS
+    ]
+    heading = ["arm", "median depth error (%)", "median normal error (degrees)", "test PSNR (dB)", "number"]
+    text = f"{kit.title(description)}; {args.iterations} iterations\n\n{markdown_table(heading, rows)}"
+    result = {**description, "settings": ARMS, "records": records}
+    return kit.Report(result, draw(records), text, kit.arms_of(records, "arm", ("psnr", "depth_error")))
+
+
+def outcome(made: SyntheticScene, arm: str, iterations: int, seed: int) -> dict[str, Any]:
+    """Train, and return the errors of depth, normals and image on the test views."""
+    recipe = configure(find_recipe(GAUSSIANS if arm == GAUSSIANS else "surfels", iterations), **ARMS[arm])
+    state = kit.train_with_progress(made.scene, recipe, seed)
+    settings = RenderSettings(made.scene.background, renderer=recipe.renderer)
+    depth_errors, angles = [], []
+    for view, truth, normals in zip(made.scene.test_views, made.test_depths, made.test_normals, strict=True):
+        output, _ = settings.render(state.model, view, frozenset({"depth"}))
+        depth = expected_depth(output.image[..., 3], output.alpha)
+        is_counted = (truth > 0) & (output.alpha > ALPHA_MIN)
+        depth_errors.append((np.abs(depth - truth) / np.where(truth > 0, truth, 1))[is_counted])
+        n = central_normals(depth.astype(np.float64), view.camera) @ view.camera.cam_from_world_R
+        has_normal = is_counted & (np.abs(n).sum(axis=2) > 0)
+        cosines = np.sum(n * normals, axis=2)[has_normal]
+        angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+    return {
+        "depth_error": 100 * float(np.median(np.concatenate(depth_errors))),
+        "normal_error": float(np.median(np.concatenate(angles))),
+        "psnr": evaluate(state.model, made.scene.test_views, settings).psnr,
+        "n_gaussians": len(state.gaussians.means),
+    }
+
+
+def draw(records: list[dict[str, Any]]) -> Figure:
+    """Draw the errors of depth and normals and the PSNR of each arm."""
+    figure = Figure(figsize=(10, 3), layout="constrained")
+    titles = {
+        "depth_error": "Median error of the depth (%)",
+        "normal_error": "Median error of normals (degrees)",
+        "psnr": "PSNR of test views (dB)",
+    }
+    for axes, (key, title) in zip(figure.subplots(1, 3, sharey=True), titles.items(), strict=True):
+        values = [mean_and_deviation([r[key] for r in records if r["arm"] == arm]) for arm in ARMS]
+        means, deviations = np.transpose(values)
+        axes.barh(list(ARMS), means, xerr=deviations, color=[GREY, *[BLUE] * (len(ARMS) - 1)])
+        axes.set_title(title, fontsize=9)
+        if key == "psnr":
+            axes.set_xlim(min(means - deviations) - 0.5, None)
+    figure.axes[0].invert_yaxis()
+    return figure
+
+
+LOSSES = declare(
+    "losses",
+    "what the losses of surfels do to depths, normals and images",
+    run,
+    *(synthetic_scene(), OUT, iterations(2000), seeds(3)),
+)
+CLAIMS = (LOSSES,)

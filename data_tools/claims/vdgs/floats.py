@@ -1,0 +1,84 @@
+"""The study ``vdgs/floats``: PSNR at held-out views with as many floats, those of the network included.
+
+Harmonics alone train a Gaussian for each of N points of the scene, drawn at random. Each mode trains as many fewer as
+have the floats of its network and hash grid. Numbers stay, and all of the schedule else is that of the recipe.
+"""
+
+import argparse
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from data_tools.claims import kit
+from data_tools.claims.kit.figures import plot_deviations, with_deviation
+from data_tools.claims.vdgs.pane import floats_of
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.vdgs import modes
+from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE
+from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
+from minisplat_ref.types import Scene
+
+HARMONICS = "harmonics"
+MODES = (modes.opacity_times, modes.opacity_plus, modes.colors_times, modes.colors_plus)
+FLOATS = 59  # of a Gaussian with harmonics of degree 3
+
+
+def arms(iterations: int) -> dict[str, Recipe]:
+    """Return the recipes by arm; none changes the number of Gaussians."""
+    ours = VDGS._replace(representation=VIEW_DEPENDENT)
+    recipes = {HARMONICS: GS_ACCEL} | {mode.__name__: configure(ours, modulation=mode) for mode in MODES}
+    return {name: scale_recipe(recipe, iterations)._replace(events=()) for name, recipe in recipes.items()}
+
+
+def n_shared(scene: Scene, recipe: Recipe) -> int:
+    """Return the floats of a recipe's shared parameters."""
+    shared = recipe.representation.shared(scene, np.random.default_rng(0))
+    return sum(array.size for array in shared.values())
+
+
+def measure(scene: Scene, iterations: int, n: int, arm: str, seed: int) -> dict[str, Any]:
+    """Train an arm with the floats of n Gaussians, and return its record."""
+    recipe = arms(iterations)[arm]
+    kept = n - -(-n_shared(scene, recipe) // FLOATS)
+    if kept < 1:
+        raise InputError(
+            f"a network has more floats than {n} Gaussians: give more --gaussians, or a scene of more points"
+        )
+    rows = np.random.default_rng(seed).permutation(len(scene.points))[:kept]  # the fewer are among the more
+    part = scene._replace(points=scene.points[rows], point_colors=scene.point_colors[rows])
+    state = kit.train_with_progress(part, recipe, seed)
+    settings = RenderSettings(scene.background, renderer=recipe.renderer)
+    psnr = evaluate(state.model, scene.test_views, settings).psnr
+    return {"psnr": psnr, "gaussians": len(state.gaussians.means), "floats": floats_of(state.model)}
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train all arms with every seed."""
+    scene = kit.read_scene(args.scene, args.downscale)
+    n = min(args.gaussians, len(scene.points))
+    settings = {**kit.describe_scene(scene), "iterations": args.iterations, "gaussians": n}
+    jobs = [{"arm": arm, "seed": seed} for arm in arms(args.iterations) for seed in range(args.seeds)]
+    records = kit.resume(args.out, settings, jobs, lambda **job: [measure(scene, args.iterations, n, **job)])
+    by_arm = kit.arms_of(records, "arm", ("psnr",))
+    psnrs = {arm: [value for (value,) in values] for arm, values in by_arm.items()}
+    rows = []
+    for arm, values in psnrs.items():
+        own = next(record for record in records if record["arm"] == arm)
+        gains = np.subtract(values, psnrs[HARMONICS]).tolist()
+        rows.append(
+            [arm, f"{own['gaussians']:,}", f"{own['floats']:,}", with_deviation(values, 2), with_deviation(gains, 2)]
+        )
+    table = markdown_table(["arm", "Gaussians", "floats", "PSNR dB", "gain, seed by seed"], rows)
+    figure = Figure(figsize=(6, 3.4), layout="constrained")
+    axes = figure.subplots()
+    plot_deviations(axes, list(psnrs), list(psnrs.values()), color=BLUE, fmt="o")
+    axes.set(title=f"PSNR (dB) with {FLOATS * n:,} floats")
+    return kit.Report(
+        {**settings, "seeds": args.seeds, "records": records}, figure, f"{kit.title(settings)}\n\n{table}", arms=by_arm
+    )
