@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import BACKENDS, CUDA, CUDA_ATOMIC, Backend, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.errors import InputError
@@ -28,6 +27,7 @@ from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 from minisplat_ref.oracle.hard_cases import HARD_CASES
 from minisplat_ref.oracle.hard_cases.run import Precision, run_hard_cases, select_cases
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import BACKENDS, CUDA, CUDA_ATOMIC, Backend, get_backend
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Camera, Floats, Gaussians, Primitives, ProjectionGradient, Scene, TileGrid, View
 

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from tempfile import mkdtemp
 
-from minisplat_ref.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, integer
 
 INSTRUMENTED = ["minisplat_ref.io"]  # where files are read; compiled kernels are not Python when they run
 

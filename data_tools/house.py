@@ -14,7 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.interface.reporting import markdown_table
 
 RUN = 6  # lines; shorter runs are mostly calls with the same arguments
 TOPS = ("minisplat_ref", "data_tools", "tests")

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.reporting import describe_machine, markdown_table
 from minisplat_ref.training.loop import train
 
 WARM_UP = 20  # iterations that compile and are not timed

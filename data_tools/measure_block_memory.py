@@ -14,9 +14,9 @@ from collections.abc import Iterable, Iterator
 from itertools import repeat
 from pathlib import Path
 
-from minisplat_ref.blocks.plan import COARSE, load_asked, load_plan
-from minisplat_ref.reporting import describe_machine, markdown_table
-from minisplat_ref.runs import run_folder
+from minisplat_ref.app.blocks.plan import COARSE, load_asked, load_plan
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 
 MODEL = "sparse/0"
 N_BEFORE_TRACK = 8  # words of a point's line: its number, place, colour and error

@@ -16,15 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
-from minisplat_ref.blocks.plan import COARSE, Plan, load_asked, load_plan
-from minisplat_ref.blocks.train import is_unfinished
+from minisplat_ref.app.blocks.plan import COARSE, Plan, load_asked, load_plan
+from minisplat_ref.app.blocks.train import is_unfinished
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.scoring import load_trained
+from minisplat_ref.app.runs.settings import load, load_frame, load_photographs
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.frames import return_points
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import describe_machine, markdown_table
-from minisplat_ref.runs import run_folder
-from minisplat_ref.runs.scoring import load_trained
-from minisplat_ref.runs.settings import load, load_frame, load_photographs
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Bools, Floats, View
 
 BAND = 0.05  # of the cameras' reach

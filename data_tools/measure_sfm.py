@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from minisplat_ref.cli.sfm import FEATURES
+from minisplat_ref.app.cli.sfm import FEATURES
 from minisplat_ref.datasets.sfm import run_sfm
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.colmap import find_model, read_model
 from minisplat_ref.io.lens import import_quiet_pycolmap
-from minisplat_ref.reporting import describe_machine, markdown_table
 from minisplat_ref.types import Floats
 
 HEADING = (

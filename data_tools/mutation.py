@@ -33,8 +33,8 @@ from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB, use_db
 
 from data_tools.sources import Imports, annotations, copy_tree
-from minisplat_ref.arguments import HelpFormatter, Parser, integer
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.interface.reporting import markdown_table
 
 SETTINGS = "data_tools/mutation.toml"
 TESTS = Path("tests")

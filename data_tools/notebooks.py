@@ -36,8 +36,8 @@ from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernel
 from numpy.typing import NDArray
 from PIL import Image
 
-from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.errors import InputError, one_line
+from minisplat_ref.interface.arguments import HelpFormatter, Parser
 from minisplat_ref.io.atomic import replacing
 
 ROOT = Path(__file__).parents[1]

@@ -38,7 +38,7 @@ class Part(NamedTuple):
 ORDER = (
     Part(
         "the renderer",
-        ("types.py", "constants.py", "reference/", "rendering.py"),
+        ("types.py", "constants.py", "reference/", "rendering/"),
         (
             Step(("types.py", "constants.py"), (0,), "what is passed around, in which frames and units"),
             Step(("reference/covariance.py", "reference/projection.py"), (1,), "from an ellipsoid to an ellipse"),
@@ -49,7 +49,7 @@ ORDER = (
                 "how ellipses become pixels; how an error reaches every parameter",
             ),
             Step(("reference/depth.py", "reference/loss.py"), (5,), "depth maps; what is minimised"),
-            Step(("rendering.py",), (6,), "from parameters to an image and back"),
+            Step(("rendering/",), (6,), "from parameters to an image and back"),
         ),
     ),
     Part(
@@ -185,15 +185,15 @@ ORDER = (
     ),
     Part(
         "the application",
-        ("runs/", "comparison/", "blocks/", "reports/", "cli/"),
+        ("app/",),
         (
             Step(
-                ("cli/train.py", "runs/settings.py", "runs/run_folder.py", "runs/run.py"),
+                ("app/cli/train.py", "app/runs/settings.py", "app/runs/run_folder.py", "app/runs/run.py"),
                 (),
                 "from a command line to a run and its folder",
             ),
             Step(
-                ("comparison/", "blocks/", "reports/"),
+                ("app/comparison/", "app/blocks/", "app/reports/"),
                 (),
                 "recipes side by side; a large scene in blocks; the page of a result",
             ),

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from minisplat_ref.app.reports.images import GAP
+from minisplat_ref.app.reports.plots import PLOT_STYLE
+from minisplat_ref.app.runs import run_folder
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import read_image
 from minisplat_ref.io.atomic import replacing
-from minisplat_ref.reports.images import GAP
-from minisplat_ref.reports.plots import PLOT_STYLE
-from minisplat_ref.runs import run_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

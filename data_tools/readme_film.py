@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from data_tools.readme_figure import DOCS
+from minisplat_ref.app.reports.images import to_8_bits
+from minisplat_ref.app.runs.source import Source, open_source
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.orbits import orbit
-from minisplat_ref.progress import with_progress
-from minisplat_ref.reports.images import to_8_bits
-from minisplat_ref.runs.source import Source, open_source
 from minisplat_ref.types import view_from
 
 SHRUNK = math.log(1 / 3)  # added to the logarithms of all scales

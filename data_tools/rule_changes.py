@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from data_tools.sources import Imports, copy_tree
-from minisplat_ref.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, integer
 
 CHANGES = Path(__file__).with_suffix(".toml")
 FILES_MAX = 6  # of tests for a change, those nearest to the module

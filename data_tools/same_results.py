@@ -21,8 +21,8 @@ from typing import Any
 
 from minisplat_ref.extensions import folders
 from minisplat_ref.extensions.extension import load_extension
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import RECIPES
-from minisplat_ref.reporting import markdown_table
 
 SCENE = ("--views", "8", "--width", "64", "--height", "48", "--points", "400", "--test-every", "4")
 ITERATIONS = 300

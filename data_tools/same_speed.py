@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from minisplat_ref.reporting import describe_machine, markdown_table
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 
 SCENE = ("--views", "8", "--width", "320", "--height", "240", "--points", "10000", "--test-every", "4")
 WARM_UP, ITERATIONS = 20, 100

@@ -2,7 +2,7 @@
 
 import sys
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 
 if __name__ == "__main__":
     sys.exit(main(["sfm", *sys.argv[1:]]))

@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.arguments import HelpFormatter, Parser
+from minisplat_ref.interface.arguments import HelpFormatter, Parser
+from minisplat_ref.interface.progress import with_progress
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.oracle.comparison.signatures import (
     FILE,
@@ -31,8 +33,6 @@ from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.renderer import ComparedRenderer
-from minisplat_ref.progress import with_progress
-from minisplat_ref.reporting import describe_machine, markdown_table
 
 LEFT_OUT = ("loss", "statistics", "surface", "adam")  # stages that no fault changes
 OF_FUNCTION = ("image", "alpha", "feature_image", "accumulated_depth", "view", "view_alpha")

@@ -21,14 +21,19 @@ API = {
     "types": ("Types and constants", ("minisplat_ref.types", "minisplat_ref.constants", "minisplat_ref.errors")),
     "rendering": (
         "Rendering",
-        ("minisplat_ref.rendering", "minisplat_ref.splatting", "minisplat_ref.backends", "minisplat_ref.stages"),
+        (
+            "minisplat_ref.rendering",
+            "minisplat_ref.rendering.splatting",
+            "minisplat_ref.rendering.backends",
+            "minisplat_ref.rendering.stages",
+        ),
     ),
-    "gsplat_compat": ("gsplat's call", ("minisplat_ref.gsplat_compat", "minisplat_ref.gsplat_arguments")),
+    "gsplat_compat": ("gsplat's call", ("minisplat_ref.gsplat.call", "minisplat_ref.gsplat.arguments")),
     "reference": ("The reference", ("minisplat_ref.reference",)),
     "strategy": ("Density control", ("minisplat_ref.strategy",)),
     "training": ("Training", ("minisplat_ref.training",)),
     "methods": ("Recipes", ("minisplat_ref.methods",)),
-    "metrics": ("Metrics", ("minisplat_ref.metrics", "minisplat_ref.lpips")),
+    "metrics": ("Metrics", ("minisplat_ref.metrics", "minisplat_ref.metrics.lpips")),
     "io": ("Files", ("minisplat_ref.io",)),
     "extensions": ("Extensions", ("minisplat_ref.extensions.extension",)),
 }

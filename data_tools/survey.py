@@ -33,11 +33,11 @@ import numpy as np
 import minisplat_ref
 from data_tools.claims.kit.records import hand_out, handing_out, one_job, resume
 from data_tools.survey_errors import ERRORS, PlantedLine
-from minisplat_ref.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
+from minisplat_ref.app.runs.cluster import Workers
+from minisplat_ref.app.runs.worker import versions
 from minisplat_ref.errors import InputError
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.runs.cluster import Workers
-from minisplat_ref.runs.worker import versions
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
+from minisplat_ref.interface.reporting import markdown_table
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 COMMANDS = {
@@ -120,7 +120,7 @@ def survey(error: PlantedLine, commands: Sequence[str]) -> Outcome:
 
 def _fails(arguments: Sequence[str]) -> bool:
     """Whether a command, called here, fails."""
-    from minisplat_ref.cli import main as minisplat_ref_main
+    from minisplat_ref.app.cli import main as minisplat_ref_main
 
     with redirect_stdout(StringIO()), np.errstate(all="ignore"):
         try:

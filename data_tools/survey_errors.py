@@ -25,35 +25,41 @@ class PlantedLine(NamedTuple):
 _CALL = (
     PlantedLine(
         "expected depth: sign of alpha's gradient",
-        "gsplat_compat:_batch_vjp",
+        "gsplat.call:_batch_vjp",
         "v_alpha + v_alpha_of_depth",
         "v_alpha - v_alpha_of_depth",
     ),
     PlantedLine(
         "view matrix without the harmonics' share",
-        "gsplat_compat:render_one_vjp",
+        "gsplat.call:render_one_vjp",
         "v_R, v_t = v_R + np.outer(w, unrotated.cam_from_world_t), v_t - w",
         "pass",
     ),
     PlantedLine(
-        "means without the harmonics' share", "gsplat_compat:render_one_vjp", "v_means = v_means + v_sh.means", "pass"
+        "means without the harmonics' share", "gsplat.call:render_one_vjp", "v_means = v_means + v_sh.means", "pass"
     ),
     PlantedLine(
         "expected depth not divided",
-        "gsplat_compat:rasterization",
+        "gsplat.call:rasterization",
         "expected_depth(images[..., -1], alphas)",
         "images[..., -1]",
     ),
-    PlantedLine("colours of all cameras to the first", "gsplat_compat:_batch_vjp", "v_colors[c] if", "v_colors[0] if"),
+    PlantedLine("colours of all cameras to the first", "gsplat.call:_batch_vjp", "v_colors[c] if", "v_colors[0] if"),
+    PlantedLine("camera's centre by the transpose", "gsplat.call:remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"),
     PlantedLine(
-        "camera's centre by the transpose", "gsplat_compat:remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"
-    ),
-    PlantedLine("depths over white", "splatting:append_depths", "background.dtype.type(0)", "background.dtype.type(1)"),
-    PlantedLine(
-        "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"
+        "depths over white", "rendering.splatting:append_depths", "background.dtype.type(0)", "background.dtype.type(1)"
     ),
     PlantedLine(
-        "1 - opacity rounded", "rendering:activate_vjp", "1 / (1 + np.exp(opacity_logits))", "1 - primitives.opacities"
+        "gradient of depths lost",
+        "rendering.splatting:splat_vjp",
+        "v.colors[:, -1].copy()",
+        "np.zeros_like(projection.depths)",
+    ),
+    PlantedLine(
+        "1 - opacity rounded",
+        "rendering.renderer:activate_vjp",
+        "1 / (1 + np.exp(opacity_logits))",
+        "1 - primitives.opacities",
     ),
 )
 _EQUALITY = (

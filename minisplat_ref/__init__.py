@@ -9,24 +9,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from minisplat_ref.backends import CPU, REFERENCE, Backend, get_backend
     from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2, PROFILES, Conventions
     from minisplat_ref.errors import InputError
-    from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
+    from minisplat_ref.gsplat.call import rasterization, rasterization_vjp
     from minisplat_ref.io import load_scene
     from minisplat_ref.io.ply import load_ply, load_points, save_ply
     from minisplat_ref.rendering import render, render_vjp
+    from minisplat_ref.rendering.backends import CPU, REFERENCE, Backend, get_backend
     from minisplat_ref.types import Camera, Gaussians, RenderOutput, Scene, View
 
 __version__ = "0.2.0"  # stated here; pyproject.toml reads it, so that a checkout that is not installed knows it, too
 
 _MODULES = {
-    "minisplat_ref.backends": ("CPU", "REFERENCE", "Backend", "get_backend"),
+    "minisplat_ref.rendering.backends": ("CPU", "REFERENCE", "Backend", "get_backend"),
     "minisplat_ref.constants": ("GSPLAT_1_5", "GSPLAT_MAIN", "INRIA", "MINI_SPLATTING2", "PROFILES", "Conventions"),
     "minisplat_ref.errors": ("InputError",),
     "minisplat_ref.io": ("load_scene",),
     "minisplat_ref.io.ply": ("load_ply", "load_points", "save_ply"),
-    "minisplat_ref.gsplat_compat": ("rasterization", "rasterization_vjp"),
+    "minisplat_ref.gsplat.call": ("rasterization", "rasterization_vjp"),
     "minisplat_ref.rendering": ("render", "render_vjp"),
     "minisplat_ref.types": ("Camera", "Gaussians", "RenderOutput", "Scene", "View"),
 }

@@ -2,6 +2,6 @@
 
 import sys
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 
 sys.exit(main())

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from minisplat_ref.showing import as_bytes, one_line, to_png, to_sheet
+from minisplat_ref.interface.showing import as_bytes, one_line, to_png, to_sheet
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.integer]

@@ -39,13 +39,13 @@ from matplotlib.patches import Ellipse, FancyBboxPatch
 
 import minisplat_ref
 from figures import BLUE, GREEN, GREY, covariances2d, ellipse_axes, show, show_pixels
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import TileGrid

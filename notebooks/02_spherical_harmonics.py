@@ -29,12 +29,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.reference.compositing import composite
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_colors
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Gaussians, TileGrid
 
 

@@ -30,7 +30,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show_code, show_pixels
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.tracer import pixel_rays
@@ -40,6 +39,7 @@ from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Gaussians, TileGrid
 
 # %%

@@ -35,13 +35,13 @@ from matplotlib.patches import Rectangle
 from scipy.optimize import brentq
 
 from figures import BLUE, GREY, RED, draw_ellipses, show_code, show_pixels
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite, composite_hits_vjp, composite_vjp
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Gaussians, Projection, TileGrid
 
 # %%

@@ -31,11 +31,11 @@ import numpy as np
 from matplotlib.collections import EllipseCollection
 
 from figures import BLUE, GREY, RED, YELLOW, covariances2d, ellipse_axes, show, show_code, show_error
-from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, render, render_vjp
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.training.adam import adam_step
 from minisplat_ref.training.initial_state import initial_state

@@ -33,12 +33,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses, show, show_code, show_error
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import RenderSettings, render, render_vjp
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.blur_split import is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_children, screen_gradient_norms
 from minisplat_ref.training.initial_state import initial_state

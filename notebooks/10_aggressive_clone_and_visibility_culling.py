@@ -36,11 +36,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code, show_error
-from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting2
 from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import RenderSettings, render, render_vjp
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy import aggressive_clone, visibility
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import screen_gradient_norms

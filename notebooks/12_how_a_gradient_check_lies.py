@@ -30,7 +30,6 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show_code
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.differences import (
     CENTRAL,
@@ -48,6 +47,7 @@ from minisplat_ref.oracle.planted import PLANTED, plant
 from minisplat_ref.oracle.setting import Setting, make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL, GRADIENT_REL_NEAR_THRESHOLD
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Gaussians
 
 # %%

@@ -34,7 +34,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREEN, GREY, RED, draw_ellipses, show
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.renderers import (
@@ -50,6 +49,7 @@ from minisplat_ref.oracle.golden.files import export
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import Recipe, inputs, truth
 from minisplat_ref.oracle.planted import plant
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 
 
 def show_digits(axes, given, expected, title, lowest=-16):

@@ -31,11 +31,10 @@ import numpy as np
 from IPython.display import display
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show
-from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.app.reports.bench_figure import pareto_figure
 from minisplat_ref.bench.benchmark import benchmark
 from minisplat_ref.bench.contenders import all_contenders
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
-from minisplat_ref.bench.figure import pareto_figure
 from minisplat_ref.bench.judging import backward, expect, failure, forward, judge
 from minisplat_ref.bench.judging import relative_errors as by_parameter
 from minisplat_ref.bench.workloads import synth
@@ -43,6 +42,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.planted import plant
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE, BENCH_FLOAT64
 from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import TileGrid
 
 # %% tags=["rounding"]

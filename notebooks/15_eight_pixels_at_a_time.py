@@ -35,7 +35,6 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.worked_rows import count_worked_rows
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -46,6 +45,7 @@ from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.lanes import WIDTH, load, store
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.scalar.compositing import Frame, blend
 from minisplat_ref.types import Projection, TileGrid
 

@@ -38,7 +38,6 @@ from data_tools.claims.analytic import METHODS, OPACITY, REACH, approximations, 
 from data_tools.claims.proxies.affine import RADIUS, flat_gaussians, roll
 from data_tools.claims.proxies.affine import camera as card_camera
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.antialiasing.reference import smooth
@@ -59,6 +58,7 @@ from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import RenderSettings, Request, render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train

@@ -48,7 +48,6 @@ from data_tools.claims.rays.demo import (
     world_of,
 )
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.rays.kernels import tree_of
@@ -63,6 +62,7 @@ from minisplat_ref.mechanisms.tangent.rays import ewa_hits, ray_colors, tangent_
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import SPLATTING, Request, activate
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Model, Primitives, view_from
 
 # %%

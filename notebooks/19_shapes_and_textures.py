@@ -41,7 +41,6 @@ from data_tools.claims.polygons import edits as polygon_claims
 from data_tools.claims.rays.demo import ball as ball_of_discs
 from data_tools.claims.textured import colors_across
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.analytic.reference import NORMAL, integrals
 from minisplat_ref.extensions.cuts.curve import VERTICES, evaluate_cuts
@@ -56,6 +55,7 @@ from minisplat_ref.mechanisms.meshes.fans import fit_spans, rims
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Model, view_from
 
 # %% tags=["rounding"]

@@ -36,7 +36,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREY, RED, YELLOW, show, show_code
-from minisplat_ref.backends import REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing import plain
 from minisplat_ref.cuda.compositing import tiles
@@ -44,6 +43,7 @@ from minisplat_ref.cuda.compositing.forward import forward_kernel
 from minisplat_ref.cuda.target import WARP
 from minisplat_ref.cuda.tiling import TILE
 from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.rendering.backends import REFERENCE, get_backend
 from minisplat_ref.types import Projection, TileGrid
 
 CUDA = get_backend("cuda")

@@ -31,7 +31,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.extensions.gdgs.reference import contract, disperse
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.fusion.extraction import extract
@@ -41,6 +40,7 @@ from minisplat_ref.mechanisms.surfels import response
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Gaussians, Model, view_from
 
 # %%

@@ -32,7 +32,6 @@ import numpy as np
 from data_tools.claims.lens import footprints
 from data_tools.claims.wave import measures as claims
 from figures import BLUE, GREEN, GREY, RED, show, show_code
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
@@ -43,6 +42,7 @@ from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
 from minisplat_ref.mechanisms.cameras.ray_footprints import hit
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Gaussians, Model, Optics, Primitives, view_from
 
 # %%

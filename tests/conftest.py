@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from browser import Browser, find_browser
-from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.rendering.backends import BACKENDS, CPU, REFERENCE
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -12,7 +12,7 @@ import pytest
 
 import minisplat_ref
 from minisplat_ref import cpu, reference, scalar
-from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
+from minisplat_ref.rendering.backends import BACKENDS, REFERENCE, Backend
 
 MODULES = [module.name for module in iter_modules(reference.__path__)]
 STAGES = [

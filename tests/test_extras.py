@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref import save_ply
-from minisplat_ref.cli.guard import EXTRAS
+from minisplat_ref.app.cli.guard import EXTRAS
 from photo_scenes import write_transforms
 from scenes import as_dtype, make_gaussians
 
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 CODE = """
 import sys
 sys.modules |= {"matplotlib": None, "pycolmap": None}
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 

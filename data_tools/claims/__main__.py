@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from data_tools.claims import all_claims, find_claim
 from data_tools.claims.kit.claim import Claim
 from data_tools.claims.kit.records import hand_out, handing_out, one_job
-from minisplat_ref.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
-from minisplat_ref.cli.guard import check_packages, run_guarded
-from minisplat_ref.runs.cluster import Workers
+from minisplat_ref.app.cli.guard import check_packages, run_guarded
+from minisplat_ref.app.runs.cluster import Workers
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
 
 PROGRAM = "data_tools.claims"
 DESCRIPTION = """\

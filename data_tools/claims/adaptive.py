@@ -37,6 +37,8 @@ from data_tools.claims.kit.claim import (
 from data_tools.claims.kit.conditions import get_condition
 from data_tools.claims.kit.figures import standard_error
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import BLUE, GREEN, OCHRE, PURPLE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import gaussian_splatting, get_recipe
 from minisplat_ref.methods.adaptive.degrees import cut_degrees_when_cooling, raise_degrees
 from minisplat_ref.methods.adaptive.growth import grow
@@ -44,8 +46,6 @@ from minisplat_ref.methods.adaptive.numbers import RAISED
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, PURPLE, RED
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates, n_coefficients, present_degrees
 from minisplat_ref.training.schedule import Recipe, as_trained, configure, does, scale_recipe, settings_of

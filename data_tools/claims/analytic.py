@@ -15,10 +15,10 @@ from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, number, seed
 from data_tools.claims.kit.figures import set_ticks
 from minisplat_ref.extensions.analytic.reference import EXACT_RESPONSE, LOGISTIC, NORMAL, RESPONSE, integrals
+from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.reference.antialiasing import compensations
 from minisplat_ref.reference.hits import CONIC, Response
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.types import Floats, Projection
 
 SIGMAS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # px

@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, downscale, iterations, scene, seeds
 from data_tools.claims.kit.figures import plot_band, show, with_deviation
-from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.antialiasing.method import apply_filters, with_2d_filter, with_3d_filter
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.sampling import block_means, shrink_photographs, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.compensation import compensation, with_compensation
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View, view_from

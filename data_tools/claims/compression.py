@@ -29,12 +29,12 @@ from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression.msz import MSZ
 from minisplat_ref.extensions.compression.spz import SPZ
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.types import Floats, Gaussians, View
 
 SHRUNK = (1.0, 1 / 8, 1 / 64, 1 / 512)  # sizes of the scene, relative to the original

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, PLY, SCENE, declare, downscale, iterations, number, seed
+from minisplat_ref.interface.palette import BLUE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io import load_ply
 from minisplat_ref.methods import get_recipe, mini_splatting, mini_splatting2
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import render
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.visibility import culled_fraction

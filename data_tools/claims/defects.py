@@ -28,11 +28,11 @@ from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_SCENE, argumen
 from data_tools.claims.pose import move
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import BLUE, GREEN, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.switches import SWITCHES
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, RED
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import firing_steps
 from minisplat_ref.training.sky import unit_rays

@@ -22,6 +22,8 @@ from data_tools.claims.kit.claim import OUT, SEEDS, SYNTHETIC_SCENE, declare, it
 from data_tools.claims.kit.figures import plus_minus, summarise
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, SyntheticScene, make_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import BLUE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.methods.mini_splatting import (
     BACKDROP_EXTENTS,
@@ -33,8 +35,6 @@ from minisplat_ref.methods.mini_splatting import (
 )
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, as_model
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
     blend_points,

@@ -23,6 +23,7 @@ from minisplat_ref.extensions.discretized_sdf.losses import projection
 from minisplat_ref.extensions.discretized_sdf.population import WIDTH, SDFSurfels, facing, with_distances
 from minisplat_ref.extensions.discretized_sdf.reference import opacity_logits, projected, reference_sharpness
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
@@ -32,7 +33,6 @@ from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.initialization import from_means
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.schedule import configure

@@ -20,9 +20,9 @@ from data_tools.claims import kit
 from data_tools.claims.kit import recovery
 from data_tools.claims.kit.claim import CALIBRATION, declare
 from data_tools.claims.kit.recovery import ARMS, COLORS
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, RenderSettings
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configure

@@ -26,13 +26,13 @@ from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_OUT, SEEDS, ar
 from data_tools.claims.kit.coverage import count_covering_views
 from data_tools.claims.kit.figures import standard_error
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.interface.palette import SERIES
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.scene import camera_extent
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.adaptive.numbers import TRAIN_VIEWS_MIN
 from minisplat_ref.metrics import ViewMetrics, correct_colors, evaluate, psnr
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import describe_machine, markdown_table
-from minisplat_ref.reports.palette import SERIES
 from minisplat_ref.strategy.line_of_sight import hidden_share
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, as_trained, configure_by_name

@@ -20,6 +20,8 @@ from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.games.method import GAMES, on_faces
+from minisplat_ref.interface.palette import BLUE, GREY
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.fusion.extraction import extract
 from minisplat_ref.mechanisms.fusion.kernels import fuse
 from minisplat_ref.mechanisms.fusion.volume import DepthMap, Grid, empty_volume
@@ -27,8 +29,6 @@ from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.pinhole import points_at
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState

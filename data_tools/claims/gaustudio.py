@@ -25,9 +25,9 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.gaustudio.losses import sky_opacity
 from minisplat_ref.extensions.gaustudio.modules import all_stages
 from minisplat_ref.extensions.gaustudio.sky_masks import by_color, from_files
+from minisplat_ref.interface.palette import BLUE, GREY
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY
 from minisplat_ref.training.schedule import Recipe, configure, parse_settings
 from minisplat_ref.types import Bools, Floats, Scene, View
 

@@ -13,14 +13,14 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, recipe, seeds, synthetic_scene
 from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
-from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.interface.palette import BLUE, GREY
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Model
 

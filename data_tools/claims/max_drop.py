@@ -29,16 +29,16 @@ from data_tools.claims.kit.claim import (
     recipe,
 )
 from data_tools.claims.kit.conditions import get_condition
-from minisplat_ref.arguments import decibels, list_of
+from minisplat_ref.app.runs.opened_run import Run, check_views
+from minisplat_ref.app.runs.rate_distortion import paired_drop
+from minisplat_ref.app.runs.settings import Settings
+from minisplat_ref.app.runs.simplification import Target, decide, finish, measuring, metrics_of
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import CORE
+from minisplat_ref.interface.arguments import decibels, list_of
+from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED
-from minisplat_ref.runs.opened_run import Run, check_views
-from minisplat_ref.runs.rate_distortion import paired_drop
-from minisplat_ref.runs.settings import Settings
-from minisplat_ref.runs.simplification import Target, decide, finish, measuring, metrics_of
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.schedule import as_trained
 from minisplat_ref.types import Scene, number_views

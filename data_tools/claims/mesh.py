@@ -17,18 +17,18 @@ from data_tools.claims import kit
 from data_tools.claims.kit.claim import NAMES, RESUMED_OUT, SEEDS, SYNTHETIC_SCENE, argument, declare, iterations
 from data_tools.claims.kit.figures import plot_deviations, with_deviation
 from data_tools.claims.kit.mesh_distances import OrientedPoints, compare_surfaces, sample_surface
+from minisplat_ref.app.runs.depth_maps import DepthKind
+from minisplat_ref.app.runs.meshing import Asked, Opened, mesh_run
+from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.interface.palette import SERIES
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.viewpoints import scene_viewpoints
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import points_at
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import SERIES
-from minisplat_ref.runs.depth_maps import DepthKind
-from minisplat_ref.runs.meshing import Asked, Opened, mesh_run
-from minisplat_ref.runs.scoring import Trained
 from minisplat_ref.training.schedule import Recipe, as_trained, configure_by_name
 from minisplat_ref.types import FILE_FRAME
 

@@ -14,15 +14,15 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, downscale, iterations, scene, seeds
 from data_tools.claims.kit.figures import plot_band, show, with_deviation
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
+from minisplat_ref.interface.palette import BLUE, BROWN, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, BROWN, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Floats, Model, Scene, view_from
 

@@ -19,12 +19,12 @@ from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
 from data_tools.claims.kit.mesh_distances import OrientedPoints, compare_surfaces
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.mvg.insertion import Insertions, Photographed, Rules, propose, smooth_map
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances, unproject
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between
 from minisplat_ref.reference.pinhole import pinhole_rays
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE
 from minisplat_ref.types import Camera, Floats
 
 SHARES = (0.05, 0.1, 0.2)

@@ -11,6 +11,8 @@ from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, Argument, argument, declare, number, seed
 from data_tools.claims.kit.figures import table_of
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, SH_C0, Conventions
+from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.tangent.planes import hit, project
 from minisplat_ref.mechanisms.tangent.rays import (
     METHODS,
@@ -24,8 +26,6 @@ from minisplat_ref.mechanisms.tangent.rays import (
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.hits import blending_order
 from minisplat_ref.rendering import activate
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.types import Camera, Floats, Gaussians, Primitives
 
 BARE = GSPLAT_MAIN._replace(eps2d=0.0)

@@ -22,9 +22,9 @@ from data_tools.claims.kit import recovery
 from data_tools.claims.kit.claim import CALIBRATION, argument, declare
 from data_tools.claims.kit.recovery import ARMS
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configure

@@ -30,13 +30,13 @@ from data_tools.claims import kit
 from data_tools.claims.adaptive import WARM_UP
 from data_tools.claims.kit.claim import CONTINUES, RESUMED_SCENE, SEEDS, declare, iterations, recipe
 from data_tools.claims.kit.figures import plus_minus, standard_error, summarise
-from minisplat_ref.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import BLUE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, RED
+from minisplat_ref.rendering.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train

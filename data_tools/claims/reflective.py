@@ -17,6 +17,7 @@ from data_tools.claims.kit.claim import OUT, declare, seeds
 from data_tools.claims.kit.figures import show, with_deviation
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import (
@@ -34,7 +35,6 @@ from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import Request
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, view_from
 
 ALBEDO, ROUGHNESS = 0.9, 0.1  # of the metal

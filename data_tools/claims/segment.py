@@ -20,9 +20,9 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.segment.assignment import labels
 from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.votes import count_votes
+from minisplat_ref.interface.palette import SERIES
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import SPLATTING
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import SERIES
 from minisplat_ref.types import Gaussians, Ints
 
 BIASES = (-0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6)

@@ -34,15 +34,15 @@ from data_tools.claims.kit.claim import (
     recipe,
 )
 from data_tools.claims.kit.figures import mean_and_deviation, plus_minus
-from minisplat_ref.arguments import fraction, list_of
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.datasets.synthetic.surface import chamfer, unproject_views
+from minisplat_ref.interface.arguments import fraction, list_of
+from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io import load_ply
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.strategy import simplify
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import Edit, n_rows

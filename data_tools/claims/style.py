@@ -19,10 +19,10 @@ from data_tools.claims.kit.figures import show, with_deviation
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.style.styling import Plan, stylise
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
 from minisplat_ref.reference.pinhole import points_at, project_into_image
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from
 
 SIDE = 96  # pixels of a swatch

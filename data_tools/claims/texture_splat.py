@@ -20,12 +20,12 @@ from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.texture_splat.baking import Maps, bake
 from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, with_textures
 from minisplat_ref.extensions.texture_splat.renderer import TEXTURED
+from minisplat_ref.interface.palette import BLUE, GREEN, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, STAGE, ReflectiveSurfels
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREEN, RED
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from
 
 WIDTH, HEIGHT = 128, 96

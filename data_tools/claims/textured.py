@@ -23,9 +23,9 @@ from data_tools.claims.kit import claim as study
 from data_tools.claims.kit.figures import with_deviation
 from minisplat_ref.extensions.textured.reference import frames, meet
 from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import most_important

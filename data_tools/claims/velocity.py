@@ -15,12 +15,12 @@ import numpy as np
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import declare, iterations, seed
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY, MovingGaussians
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, Request
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scale_recipe

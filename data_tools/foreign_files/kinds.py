@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from data_tools.foreign_files import dialects, leftovers, masks, names, places, ranges, terminals
-from minisplat_ref.arguments import HelpFormatter, Parser
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.interface.arguments import HelpFormatter, Parser
+from minisplat_ref.interface.reporting import markdown_table
 
 Case = Callable[[Path], None]
 

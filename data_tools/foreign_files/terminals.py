@@ -17,10 +17,10 @@ import numpy as np
 from data_tools.foreign_files.building import NAMES, OPTIONS, done, room
 from data_tools.foreign_files.dialects import gaussians
 from minisplat_ref import render
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import save_ply
-from minisplat_ref.runs.progress import Progress
 from minisplat_ref.types import Camera
 
 NAME = "\u0416\u00f3\u0142\u0107-\u732b"  # letters that no one-byte code page has together
@@ -92,7 +92,7 @@ def _lone_surrogate(folder: Path) -> None:
 
 def render_in_child(queue: Any, backend: str) -> None:
     """Render in another process, and send the image's mean or what was refused."""
-    from minisplat_ref.backends import get_backend
+    from minisplat_ref.rendering.backends import get_backend
 
     try:
         queue.put(float(render(gaussians(), CAMERA, backend=get_backend(backend))[0].image.mean()))

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from data_tools.fuzz.readers import Mutant, Reader
+from minisplat_ref.app.runs.run import peak_rss_mb
 from minisplat_ref.errors import LINE_MAX, InputError, InputWarning
-from minisplat_ref.runs.run import peak_rss_mb
 
 MEMORY_FACTOR = 32  # times the bytes of all files: the three characters `[],` of JSON become an object of 64 bytes
 NATIVE_FREE = 100_000_000  # bytes by which the process may grow besides: threads, and libraries on first use

@@ -14,6 +14,9 @@ from PIL import Image
 from data_tools.foreign_files.dialects import as_version_4
 from data_tools.foreign_files.ksplat import write_ksplat
 from data_tools.fuzz.mutations import Choose, damage
+from minisplat_ref.app.inventory import take_inventory
+from minisplat_ref.app.runs import settings
+from minisplat_ref.app.runs.run_folder import CONFIG
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -23,15 +26,12 @@ from minisplat_ref.io import load_ply, load_scene, save_ply, viewpoints, write_i
 from minisplat_ref.io.formats import read_content
 from minisplat_ref.io.frames import place_scene
 from minisplat_ref.io.images import read_image
-from minisplat_ref.io.inventory import take_inventory
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.ply import load_points
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.golden import files as golden
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
-from minisplat_ref.runs import settings
-from minisplat_ref.runs.run_folder import CONFIG
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.saved_state import load_state, save_state

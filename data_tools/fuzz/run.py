@@ -18,8 +18,8 @@ import numpy as np
 from data_tools.fuzz.judging import SECONDS_MAX, Verdict, judge
 from data_tools.fuzz.mutations import Choose
 from data_tools.fuzz.readers import READERS, Mutant, Reader, mutant
-from minisplat_ref.arguments import HelpFormatter, Parser, integer
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.interface.reporting import markdown_table
 
 SILENT_SECONDS = 4 * SECONDS_MAX  # a process that has said nothing for so long is ended
 ADDRESS_SPACE = 4 << 30  # bytes that a process may take beyond what it has at its start, where the system can limit it

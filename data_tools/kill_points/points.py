@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.runs import checkpoints, run_folder
+from minisplat_ref.app.runs import checkpoints, run_folder
 
 Install = Callable[[], None]
 """Prepares a process to die at its place."""
@@ -143,7 +143,7 @@ def half_a_line(name: str, nth: int) -> Install:
 
     def install() -> None:
         for module in ("progress", "curve"):
-            _patch(f"runs.{module}:append_log", wrap)
+            _patch(f"app.runs.{module}:append_log", wrap)
 
     return install
 
@@ -170,14 +170,14 @@ def compiling(n_stages: int) -> Install:
 
         return dying
 
-    return lambda: _patch("runs.first_use:warm_up", wrap)
+    return lambda: _patch("app.runs.first_use:warm_up", wrap)
 
 
 NOWHERE, OFTEN_SAVED = "nowhere", "nowhere, a checkpoint in each iteration"
 POINTS: dict[str, Install] = {
-    "start: photographs read": after("runs.settings:build_scene"),
+    "start: photographs read": after("app.runs.settings:build_scene"),
     "start: first state made": after("training.initial_state:initial_state"),
-    "start: folder made": after("runs.run_folder:create"),
+    "start: folder made": after("app.runs.run_folder:create"),
     "start: config.json written, not named": renaming(run_folder.CONFIG, is_done=False),
     "start: config.json there": renaming(run_folder.CONFIG, is_done=True),
     "start: cameras.json there": renaming(run_folder.CAMERAS, is_done=True),
@@ -201,9 +201,9 @@ POINTS: dict[str, Install] = {
     "checkpoint: the one before kept": saving_always(renaming(run_folder.PREVIOUS, True, 60)),
     "checkpoint: there": saving_always(renaming(run_folder.CHECKPOINT, True, 160)),
     "evaluation: half a line of curve.jsonl": saving_always(half_a_line(run_folder.CURVE, 2)),
-    "evaluation: last checkpoint there": before("runs.run:save_model"),
+    "evaluation: last checkpoint there": before("app.runs.run:save_model"),
     "evaluation: PLY written, not named": renaming(run_folder.POINT_CLOUD, is_done=False),
-    "evaluation: first image there": after("runs.scoring:write_image"),
+    "evaluation: first image there": after("app.runs.scoring:write_image"),
     "evaluation: renders/ there": renaming(run_folder.RENDERS, is_done=True),
     "evaluation: metrics.json written, not named": renaming(run_folder.METRICS, is_done=False),
     "evaluation: metrics.json there": renaming(run_folder.METRICS, is_done=True),

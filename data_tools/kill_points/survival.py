@@ -26,13 +26,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from data_tools.kill_points.points import NOWHERE, OFTEN_SAVED, POINTS
+from minisplat_ref.app.runs import checkpoints, run_folder
+from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.atomic import is_part
 from minisplat_ref.io.checkpoint import load_checkpoint
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.runs import checkpoints, run_folder
-from minisplat_ref.runs.progress import read_log
 
 SCENE: dict[str, Any] = {"n_views": 6, "width": 32, "height": 24, "n_points": 120, "test_every": 4}
 # Mini-Splatting, whose events at 240 iterations are: densify at 20, start again from depth at 40 and 80, simplify and

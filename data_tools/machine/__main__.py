@@ -4,9 +4,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from minisplat_ref.arguments import HelpFormatter, Parser, integer, list_of, name
-from minisplat_ref.cli.bench import add_output_arguments, progress, publish
+from minisplat_ref.app.cli.bench import add_output_arguments, progress, publish
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, integer, list_of, name
 from minisplat_ref.oracle.cases import Report
 
 

@@ -19,7 +19,9 @@ import numpy as np
 
 from data_tools.machine.process_memory import bytes_in_use, forget_peak, peak
 from minisplat_ref import memory
-from minisplat_ref.backends import CPU
+from minisplat_ref.app.runs import room
+from minisplat_ref.app.runs.run import run_training
+from minisplat_ref.app.runs.settings import Settings, load_photographs, recipe_of
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -27,9 +29,7 @@ from minisplat_ref.io.images import resize_image, write_image
 from minisplat_ref.io.ply_file import write_vertices
 from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.oracle.cases import Case, Figure
-from minisplat_ref.runs import room
-from minisplat_ref.runs.run import run_training
-from minisplat_ref.runs.settings import Settings, load_photographs, recipe_of
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.state import TrainState

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from data_tools.machine.contests import Contest, in_ms
-from minisplat_ref.backends import CPU, REFERENCE, Backend
 from minisplat_ref.bench.interleaving import Task, Times
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN, SH_DEGREE_MAX
@@ -13,6 +12,7 @@ from minisplat_ref.jit.compile import kernel, prange
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU, REFERENCE, Backend
 from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Primitives, ProjectionGradient
 

@@ -19,12 +19,12 @@ import numpy as np
 from data_tools.machine.process_memory import bytes_in_use, forget_peak, peak
 from data_tools.machine.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref import memory
-from minisplat_ref.backends import CPU
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLIPPED_PIXELS
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Gaussians
 
 N, SIZE = 200_000, LARGE

@@ -34,7 +34,7 @@ def _from_status(key: str) -> int | None:
 
 
 def _most_so_far() -> int:
-    from minisplat_ref.runs.run import peak_rss_mb
+    from minisplat_ref.app.runs.run import peak_rss_mb
 
     megabytes = peak_rss_mb()
     if megabytes is None:

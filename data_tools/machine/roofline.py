@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_tools.machine.contests import Contest, in_ms
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.interleaving import Times
 from minisplat_ref.bench.worked_rows import count_worked_rows
 from minisplat_ref.bench.workloads import Workload
@@ -36,6 +35,7 @@ from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.scalar.compositing import blend, conic_vjp_of_moments, factors, sigma_vjp
 from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileGrid
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.bench.interleaving import time_interleaved
 from minisplat_ref.bench.workloads import Workload, synth
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLIPPED_PIXELS, BENCH_FLOAT32_IMAGE
 from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Floats, Gaussians
 
 FOCAL_OF_WIDTH = 400 / 480  # of ``synth``: a larger image shows the same at a higher resolution

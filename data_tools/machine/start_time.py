@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.backends import REFERENCE
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
@@ -20,8 +21,7 @@ from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.cases import Case
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_LOSS
-from minisplat_ref.runs import run_folder
-from minisplat_ref.runs.progress import read_log
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 

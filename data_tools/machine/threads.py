@@ -9,7 +9,6 @@ import numpy as np
 
 from data_tools.machine.contests import Contest
 from data_tools.machine.roofline import StraightLines
-from minisplat_ref.backends import CPU
 from minisplat_ref.bench.interleaving import Times, seconds_of
 from minisplat_ref.bench.profiling import REST, WHOLE, time_stages
 from minisplat_ref.bench.training_time import WARM_UP, load_or_make_scene
@@ -17,6 +16,7 @@ from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Gaussians

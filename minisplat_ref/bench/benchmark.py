@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.contenders import BASELINE_NAME, CHECKED_NAME, REFERENCE_NAME, Contender, all_contenders
 from minisplat_ref.bench.judging import Expected, Verdict, backward, expect, failure, forward, judge, with_slack
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.cases import Case, Figure
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 
 SLOW_SECONDS = 4.0  # a contender that takes longer runs only once: it would heat the machine for the others
 MILLI = 1e3

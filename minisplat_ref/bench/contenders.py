@@ -11,17 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import (
-    BACKENDS,
-    CPU,
-    CPU_EXACT,
-    CUDA,
-    CUDA_ATOMIC,
-    PLAIN,
-    REFERENCE,
-    Backend,
-    get_backend,
-)
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.passes import RASTERIZATION, RENDER, Passes
 from minisplat_ref.bench.textbook import TEXTBOOK
@@ -33,6 +22,17 @@ from minisplat_ref.oracle.tolerances import (
     BENCH_FLOAT32_GRADIENT,
     BENCH_FLOAT32_IMAGE,
     BENCH_FLOAT64,
+)
+from minisplat_ref.rendering.backends import (
+    BACKENDS,
+    CPU,
+    CPU_EXACT,
+    CUDA,
+    CUDA_ATOMIC,
+    PLAIN,
+    REFERENCE,
+    Backend,
+    get_backend,
 )
 from minisplat_ref.types import CompositeGradient, Floats, Projection, RenderOutput, TileBins
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.bench.interleaving import Times, seconds_of, time_interleaved
 from minisplat_ref.bench.textbook import TEXTBOOK
 from minisplat_ref.bench.workloads import Workload
@@ -22,6 +21,7 @@ from minisplat_ref.extensions.extension import CORE, Extension
 from minisplat_ref.oracle.cases import Case
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_IMAGE, BENCH_FLOAT64, BENCH_OFF_PIXELS
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 
 MILLI = 1e3

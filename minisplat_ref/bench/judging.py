@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.bench.contenders import Contender
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.oracle.thresholds import Thresholds, thresholds_of_view
 from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering.backends import CPU, Backend
 from minisplat_ref.types import Floats, Gaussians
 
 

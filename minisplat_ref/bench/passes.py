@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
+from minisplat_ref.gsplat.call import rasterization, rasterization_vjp
 from minisplat_ref.rendering import RenderTape, render, render_vjp
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 

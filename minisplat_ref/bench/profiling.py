@@ -9,8 +9,8 @@ from dataclasses import fields, replace
 from functools import wraps
 from typing import Any
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.oracle.cases import Case
+from minisplat_ref.rendering.backends import Backend
 
 REST, WHOLE = "rest", "whole iteration"
 

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import kernel, n_threads, prange
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import CompositeGradient, Floats, Ints, Projection, RenderOutput, TileBins
 
 

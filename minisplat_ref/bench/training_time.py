@@ -7,13 +7,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.bench.opensplat import iteration_seconds
 from minisplat_ref.bench.profiling import profile_cases, time_stages
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.cases import Case, Figure
+from minisplat_ref.rendering.backends import CPU, Backend
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 

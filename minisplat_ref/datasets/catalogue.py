@@ -15,8 +15,8 @@ from importlib.resources import files
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
-from minisplat_ref.arguments import did_you_mean
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import did_you_mean
 
 HOST, PAGES = "https://raw.githubusercontent.com", "https://github.com"
 PHOTOS = "photos"  # folder of the photographs, where ``sfm`` finds them

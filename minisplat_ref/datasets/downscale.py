@@ -8,6 +8,7 @@ from pathlib import Path
 
 from minisplat_ref.datasets.photo_files import list_images
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import (
     check_downscale,
@@ -17,7 +18,6 @@ from minisplat_ref.io.images import (
     resize_image,
     write_image,
 )
-from minisplat_ref.progress import with_progress
 
 
 def downscale_images(images: Path, factor: int) -> Path:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from minisplat_ref.datasets.catalogue import File
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import Bar, progress_bar
 from minisplat_ref.io.atomic import is_part, remove_parts, replacing, unwritable
-from minisplat_ref.progress import Bar, progress_bar
 
 CHUNK = 1 << 16  # bytes between two moves of the bar
 TIMEOUT = 30.0  # seconds without an answer

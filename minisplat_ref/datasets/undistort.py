@@ -17,6 +17,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos, find_model, read_model, write_model
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image, write_image
@@ -24,7 +25,6 @@ from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
 from minisplat_ref.io.transforms import find_frames, find_points, find_transforms, read_transforms
-from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Camera
 
 # What a transforms.json says about lenses; every frame gets its pinhole's entries instead.

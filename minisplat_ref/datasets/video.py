@@ -16,8 +16,8 @@ from scipy import ndimage
 
 from minisplat_ref.constants import LUMA
 from minisplat_ref.errors import InputError, one_line
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.images import DAMAGE_ERRORS, write_image
-from minisplat_ref.progress import with_progress
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".gif")
 SECONDS = 0.5  # of a video, from which one frame is kept

@@ -1,6 +1,6 @@
 """Files of a run that relatives read, too: their names, and where a command finds them that takes a run or a PLY.
 
-Whoever needs a run with its recipe and its photographs is the application, and opens it by :mod:`minisplat_ref.runs`.
+What needs a run with its recipe and its photographs is the application, which opens it (:mod:`minisplat_ref.app.runs`).
 """
 
 from pathlib import Path

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.empty_masks import TRAIN_VIEWS_MIN, MaskFiles, find_empty, report_empty
 from minisplat_ref.io.images import (
     MASK_THRESHOLD,
@@ -34,7 +35,6 @@ from minisplat_ref.io.images import (
 from minisplat_ref.io.lens import Lens, optics_of, pinhole_of, undistort
 from minisplat_ref.io.names import is_file
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
-from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it

@@ -6,12 +6,12 @@ order of Gaussians, passes there. It does not pass here, unless all backends are
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.differences import largest_error, relative_error
 from minisplat_ref.oracle.models import Stages, model_settings, model_stages
 from minisplat_ref.oracle.tolerances import COMPARE_FLOAT64
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref.interface.reporting import machine, markdown_table
 from minisplat_ref.io.atomic import replacing
-from minisplat_ref.reporting import machine, markdown_table
 
 Figure = float | int | str | None
 

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_1_5, Conventions
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.oracle.differences import (
     STEPS,
@@ -35,7 +35,7 @@ from minisplat_ref.oracle.tolerances import (
     GRADIENT_REL_NEAR_THRESHOLD,
     PEER_REL,
 )
-from minisplat_ref.progress import with_progress
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import Floats
 
 AUTOGRAD = "torch autograd"

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.cases import Case
 from minisplat_ref.oracle.differences import Point, settled_derivative
@@ -26,6 +25,7 @@ from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.oracle.setting import Setting, make_setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats

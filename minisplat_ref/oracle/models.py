@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.oracle.setting import POSE, Setting, make_setting
 from minisplat_ref.oracle.stages import Stage, watch
-from minisplat_ref.progress import with_progress
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
 

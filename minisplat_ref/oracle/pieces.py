@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref import reference, rendering, splatting
+from minisplat_ref import reference, rendering
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, Conventions
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting, make_setting
@@ -26,6 +26,7 @@ from minisplat_ref.oracle.stages import (
     with_module,
 )
 from minisplat_ref.reference.hits import CONIC, Hit, Response, tile_hits
+from minisplat_ref.rendering import splatting
 from minisplat_ref.types import Floats, Ints, Projection, TileBins, TileGrid
 
 Module = Any

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import SH_C2, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.projection import project_vjp as reference_project_vjp
-from minisplat_ref.stages import CompositeVjp
+from minisplat_ref.rendering.backends import CPU, Backend
+from minisplat_ref.rendering.stages import CompositeVjp
 from minisplat_ref.types import (
     Camera,
     CompositeGradient,

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
-from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
+from minisplat_ref.gsplat.call import rasterization, rasterization_vjp
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage, watch
 from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats
 
 

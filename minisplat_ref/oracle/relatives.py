@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.cases import Case, Report
@@ -20,7 +20,7 @@ from minisplat_ref.oracle.gradients import by_backend
 from minisplat_ref.oracle.loss_terms import loss_cases, own_terms, stage_name
 from minisplat_ref.oracle.models import TIME, Stages, model_cases
 from minisplat_ref.oracle.pieces import SEED
-from minisplat_ref.progress import with_progress
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import Recipe

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
 from minisplat_ref.oracle.cases import Case, Figure, Report
+from minisplat_ref.rendering.backends import BACKENDS, REFERENCE, Backend
 from minisplat_ref.training.adam import fields_of
 from minisplat_ref.training.case import Case as View
 from minisplat_ref.training.guard import Examination, examine

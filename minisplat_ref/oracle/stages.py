@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref import rendering, splatting
-from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref import rendering
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.differences import Function, Point, Vjp
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
+from minisplat_ref.rendering import splatting
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import (
     Camera,
     Floats,

@@ -34,11 +34,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
 from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, Margins
 from minisplat_ref.reference.hits import TileHits, conic_matrices, tile_hits
-from minisplat_ref.splatting import SplatTape
+from minisplat_ref.rendering.backends import CPU
+from minisplat_ref.rendering.splatting import SplatTape
 from minisplat_ref.types import Bools, Floats, Projection, TileBins, TileGrid
 
 

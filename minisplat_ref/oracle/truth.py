@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.tolerances import TRUTH_FLOAT32, TRUTH_FLOAT64
 from minisplat_ref.reference.covariance import covariances
+from minisplat_ref.rendering.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.types import Camera, Floats, Projection, TileGrid
 
 DIGITS = 50

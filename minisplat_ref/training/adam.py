@@ -15,7 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, Backend
+from minisplat_ref.rendering.backends import CPU, Backend
 from minisplat_ref.types import NOTHING, AdamStep, Floats, Ints
 
 Parameters = TypeVar("Parameters")  # a population, or a mapping of shared parameters

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.images import resize_image, resize_mask
 from minisplat_ref.io.scene import rescale_camera
-from minisplat_ref.progress import with_progress
 from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.strategy.line_of_sight import MARGIN
 from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import RenderGradient
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.adam import fields_of
 from minisplat_ref.training.case import Case, save_case
 from minisplat_ref.training.losses import Loss, Rendered, total_loss

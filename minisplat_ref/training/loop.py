@@ -7,12 +7,12 @@ import math
 import warnings
 from collections.abc import Callable
 
-from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.io.frames import choose_frame
 from minisplat_ref.io.stored_views import ReadingAhead
 from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.rendering.backends import CPU, Backend
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.initial_state import check_fits, initial_state

@@ -20,7 +20,7 @@ import numpy as np
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, RenderGradient, Request
-from minisplat_ref.splatting import splat
+from minisplat_ref.rendering.splatting import splat
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step
 from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong

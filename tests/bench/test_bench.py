@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from browser import check_page
-from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.app.cli import main
 from minisplat_ref.bench import benchmark, contenders, interleaving, profiling, training_time, workloads
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.passes import RASTERIZATION
 from minisplat_ref.bench.peers import peers_of
-from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.images import read_image
 from minisplat_ref.oracle.planted import plant
@@ -23,6 +22,7 @@ from minisplat_ref.oracle.tolerances import (
     BENCH_FLOAT64,
 )
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians
 from tiny_bench import tiny, tiny_workloads, with_pixel  # noqa: F401
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32

@@ -5,7 +5,7 @@ import pytest
 
 from cuda_simulator import run_in_simulator
 from cuda_training import N_GAUSSIANS, TRAININGS, train_by
-from minisplat_ref.backends import REFERENCE
+from minisplat_ref.rendering.backends import REFERENCE
 from tolerances import CUDA_TRAINING
 
 pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")

@@ -5,7 +5,7 @@ import pytest
 
 from cuda_simulator import run_in_simulator
 from cuda_stages import CASES, LOSSES, run_stages
-from minisplat_ref.backends import REFERENCE
+from minisplat_ref.rendering.backends import REFERENCE
 from tolerances import (
     CUDA_FLOAT32_GRADIENT,
     CUDA_FLOAT32_IMAGE,

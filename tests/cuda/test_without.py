@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.tile_state import lists_of
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.resident import Residence
 from minisplat_ref.training.state import TrainState
@@ -28,8 +28,8 @@ def run_python(code, **variables):
 def test_nothing_imports_cuda_before_it_is_asked_for():
     code = """
 import sys
-import minisplat_ref, minisplat_ref.cli, minisplat_ref.backends, minisplat_ref.runs.run
-minisplat_ref.backends.get_backend("cpu")
+import minisplat_ref, minisplat_ref.app.cli, minisplat_ref.rendering.backends, minisplat_ref.app.runs.run
+minisplat_ref.rendering.backends.get_backend("cpu")
 print([m for m in sys.modules if m.startswith(("minisplat_ref.cuda", "numba_cuda", "cuda.", "numba.cuda.cudadrv"))])
 """
     assert run_python(code).stdout.strip() == "[]"
@@ -39,7 +39,7 @@ def test_without_the_package_it_names_the_extra():
     code = """
 import sys
 sys.modules["numba_cuda"] = None
-from minisplat_ref.backends import get_backend
+from minisplat_ref.rendering.backends import get_backend
 get_backend("cuda")
 """
     assert (
@@ -51,7 +51,7 @@ get_backend("cuda")
 def test_without_a_gpu_it_says_so():
     pytest.importorskip("numba_cuda", reason="the extra minisplat_ref[cuda] is not installed")
     said = run_python(
-        "from minisplat_ref.backends import get_backend; get_backend('cuda')",
+        "from minisplat_ref.rendering.backends import get_backend; get_backend('cuda')",
         NUMBA_ENABLE_CUDASIM="0",
         CUDA_VISIBLE_DEVICES="-1",
     ).stderr

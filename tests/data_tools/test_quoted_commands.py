@@ -33,7 +33,7 @@ import pytest
 
 from data_tools.claims import all_claims, find_claim
 from data_tools.claims.__main__ import parser_of
-from minisplat_ref import cli
+from minisplat_ref.app import cli
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders
 from minisplat_ref.extensions.extension import load_extension

@@ -7,11 +7,11 @@ from PIL import Image
 
 from data_tools import readme_film
 from data_tools.readme_film import divided, film, write
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.source import open_source
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.runs.source import open_source
 from run_commands import RECIPE, SCENE
 
 LEFT, RIGHT = np.full((2, 10, 3), 10, np.uint8), np.full((2, 10, 3), 200, np.uint8)

@@ -11,11 +11,11 @@ import pytest
 from data_tools import survey as module
 from data_tools.survey import as_markdown, main, plant_in_copy, plant_in_function, survey
 from data_tools.survey_errors import ERRORS
+from minisplat_ref.app.runs import cluster
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference import adam, hits
 from minisplat_ref.reference.adam import adam_update
-from minisplat_ref.runs import cluster
 
 BY_NAME = {error.what: error for error in ERRORS}
 

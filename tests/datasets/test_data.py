@@ -9,12 +9,12 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from minisplat_ref import progress
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets import catalogue, fetching
 from minisplat_ref.datasets.catalogue import CATALOGUE, DataSet, File, files_of
 from minisplat_ref.datasets.fetching import fetch
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface import progress
 
 CONTENTS = {"LICENSE": b"free\n", "a/1.jpg": b"first" * 40_000, "a/2.jpg": b"second"}
 NAMES = ("LICENSE", "photos/1.jpg", "photos/2.jpg")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, resize_image, write_image
 from minisplat_ref.io.lens import import_pycolmap

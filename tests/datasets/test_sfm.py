@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets import sfm
 from minisplat_ref.datasets.sfm import features as features_module
 from minisplat_ref.datasets.sfm import mapping

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy import ndimage
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets import video
 from minisplat_ref.datasets.sfm import default_matching, run_sfm
 from minisplat_ref.datasets.video import is_video, keep_sharpest, sharpness

@@ -11,8 +11,7 @@ from data_tools.claims import analytic as footprint
 from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -30,6 +29,7 @@ from minisplat_ref.extensions.analytic.reference import (
 from minisplat_ref.extensions.analytic.stages import stages
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Model, Projection, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import (

@@ -11,8 +11,8 @@ from actions import act, scene_of, state_of
 from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply, save_ply
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -37,7 +37,7 @@ from minisplat_ref.mechanisms.sampling import sampling_intervals, shrink_photogr
 from minisplat_ref.methods.gaussian_splatting import clone_and_split
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.runs.progress import Progress
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.schedule import At, does, firing_steps, scale_recipe
 from minisplat_ref.types import Gaussians, Model, View, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera

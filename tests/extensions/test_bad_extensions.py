@@ -11,7 +11,7 @@ import pytest
 
 import minisplat_ref
 from minisplat_ref import extensions
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions import extension as extension_module

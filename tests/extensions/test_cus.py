@@ -9,8 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.cus import floats as study
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -50,6 +49,7 @@ from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import LossTerm, Rendered
 from minisplat_ref.training.representation import GAUSSIANS

@@ -9,8 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.cus import floats as study
 from data_tools.claims.cus import growth as growth_study
-from minisplat_ref.backends import CPU
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.cus import growth
 from minisplat_ref.extensions.cus.growth import (
@@ -25,6 +24,7 @@ from minisplat_ref.extensions.cus.method import ANCHORS, prune_insignificant
 from minisplat_ref.extensions.cus.population import as_anchors, at_rest, voxel_side
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.clone_split import screen_gradient_norms
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.training.initial_state import initial_state

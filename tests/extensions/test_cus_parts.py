@@ -6,7 +6,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims.cus import floats as study
 from data_tools.claims.kit.objects import object_ids
-from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cus import maps
@@ -23,6 +22,7 @@ from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
 from minisplat_ref.oracle.models import noisy_model, training_view
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered

@@ -11,8 +11,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.cuts import card, edge
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -29,6 +28,7 @@ from minisplat_ref.extensions.cuts.curve import (
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 from payloads import drawn, random_cuts
 from scenes import as_dtype, make_camera, make_gaussians

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extensions
 from minisplat_ref.io.frames import place_camera, place_fields
@@ -22,6 +21,7 @@ from minisplat_ref.oracle.pieces import SEED
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL_NEAR_THRESHOLD
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.types import Frame, Model

@@ -14,7 +14,7 @@ import minisplat_ref
 from data_tools.claims import find_claim
 from data_tools.claims.__main__ import parser_of
 from minisplat_ref import extensions
-from minisplat_ref.cli import _parser_of, main
+from minisplat_ref.app.cli import _parser_of, main
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.training.losses import Rendered

@@ -11,8 +11,7 @@ from actions import act, scene_of, state_of
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.fans.profile import fan_profile, mass, profile_error
 from gltf import glb_parts, only_primitive, values
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -39,6 +38,7 @@ from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Model, view_from

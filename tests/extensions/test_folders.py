@@ -6,7 +6,7 @@ from importlib import import_module
 
 import pytest
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.extensions import folders, module_of, summaries
 from minisplat_ref.extensions.extension import Extension, load_extension
 from minisplat_ref.training.schedule import describe

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from data_tools.claims import games as study
 from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.games.faces import FaceGaussians, face_frames, on_own_faces, place, place_vjp

@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
@@ -27,6 +26,7 @@ from minisplat_ref.extensions.gaustudio.reference import (
 from minisplat_ref.io.images import write_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy.removal import CHANGES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered, photometric

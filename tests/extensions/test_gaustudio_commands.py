@@ -8,12 +8,12 @@ import pytest
 
 from data_tools.claims import gaustudio as study
 from data_tools.claims.__main__ import main as measure_claim
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.depth_maps import DepthKind
 from minisplat_ref.extensions.gaustudio import modules
 from minisplat_ref.extensions.gaustudio.modules import DEPTHS, STAGES, all_stages
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image
-from minisplat_ref.runs.depth_maps import DepthKind
 
 TINY = ("--views", "9", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 OTHERS = {

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from data_tools.claims.gdgs.sphere import measure
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.gdgs import method

@@ -10,8 +10,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.lens import fisheye, footprints
 from data_tools.claims.lens.fisheye import rays_of, take_photographs
 from gradcheck import check_inner_products
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
@@ -27,6 +26,7 @@ from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import SPLATTING, Request, activate
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.types import Gaussians, Model, Optics, Primitives, Scene, view_from
 from photo_scenes import DISTORTED, assert_refused, write_colmap

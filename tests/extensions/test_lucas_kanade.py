@@ -12,8 +12,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.lucas_kanade import body as bodies
 from data_tools.claims.lucas_kanade import trainings as study
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
@@ -43,6 +42,7 @@ from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import SPLATTING, Request, activate
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from

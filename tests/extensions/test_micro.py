@@ -11,8 +11,8 @@ from actions import act, scene_of, state_of
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.micro.counts import CURVES
 from gradcheck import check_jacobian
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -37,7 +37,7 @@ from minisplat_ref.methods.gaussian_splatting import prune_large
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.runs.progress import Progress
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered

@@ -12,10 +12,9 @@ from data_tools.claims.kit import psnr_of
 from data_tools.claims.mixed import fit
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
-from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.app.cli import main
 from minisplat_ref.bench.extension_times import extension_cases
 from minisplat_ref.bench.workloads import synth5k
-from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.cpu.compositing.hits import composite_hits as composite_by_kernels
 from minisplat_ref.cpu.compositing.plain_conic import composite as composite_conics
@@ -39,6 +38,7 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians, Model, Primitives, Projection, TileGrid, view_from
 from payloads import drawn
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera

@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
@@ -22,6 +21,7 @@ from minisplat_ref.mechanisms.surfels.response import Layout
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Model, Primitives, Projection, Scene, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera

@@ -11,8 +11,8 @@ from actions import act, scene_of, state_of
 from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_inner_products
 from minisplat_ref import load_ply, save_ply
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -24,7 +24,7 @@ from minisplat_ref.extensions.multi_scale.reference import NO_CELL, are_shown, c
 from minisplat_ref.io.label import Label
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.runs.progress import Progress
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.simplify import optical_masses
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered

@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims import mvg as study
 from gradcheck import check_jacobian
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.mvg import insertion, method
@@ -30,6 +29,7 @@ from minisplat_ref.mechanisms.surfels.discs import DISCS
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.oracle.loss_terms import loss_cases
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Camera, Gaussians, Model, RenderOutput, Scene, View, view_from
 from tolerances import CLOSED_FORM

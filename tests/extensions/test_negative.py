@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_tools.claims.negative import CLAIMS, backdrop, rings
 from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref import load_ply, save_ply
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -28,7 +28,7 @@ from minisplat_ref.extensions.negative.reference import density, difference, lar
 from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
-from minisplat_ref.runs.progress import Progress
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.clone_split import prune_faint, prune_large
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import Iteration, TrainState, start_again

@@ -12,7 +12,7 @@ from actions import act, scene_of, state_of
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref import load_ply, load_scene, save_ply
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_format, find_recipe

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.omg import trained_file
@@ -25,6 +24,7 @@ from minisplat_ref.extensions.omg.svq import QUAT_MIN
 from minisplat_ref.mechanisms.networks.networks import COMPILED, IN_NUMPY
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, restart_from_means
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.initial_state import initial_state

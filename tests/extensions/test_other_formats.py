@@ -14,7 +14,7 @@ from PIL import Image
 
 from compact import population, refusal, refused_line, rotation_error
 from data_tools.foreign_files.ksplat import write_ksplat
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.extensions.compression import compressed_ply, glb, ksplat, levels8, sog, splat
 from minisplat_ref.extensions.extension import find_format

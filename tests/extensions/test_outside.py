@@ -297,7 +297,7 @@ def test_an_edited_kernel_is_compiled_alone(stranger, run_folder):
 
 
 WARM_UP = """
-from minisplat_ref.warm_up import warm_up
+from minisplat_ref.extensions.warm_up import warm_up
 
 if __name__ == "__main__":
     for compiled in warm_up([], extensions=["glow", "velocity"], n_processes=1):

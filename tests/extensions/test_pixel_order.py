@@ -11,11 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_tools.claims import pixel_order as clouds
 from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.app.cli import main
 from minisplat_ref.bench import extension_times
 from minisplat_ref.bench.extension_times import extension_cases
 from minisplat_ref.bench.workloads import synth5k
-from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -30,6 +29,7 @@ from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.rendering import SPLATTING, Request, activate
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.schedule import configure, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera

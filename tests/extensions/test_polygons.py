@@ -11,8 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -29,6 +28,7 @@ from minisplat_ref.mechanisms.rays.blending import sum_by_row
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians, Model, view_from
 from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import (

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.polygons import edits as claims
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, save_soup, soup_of

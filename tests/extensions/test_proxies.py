@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.fuzz.judging import judge
 from data_tools.fuzz.readers import Reader, mutant
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, in_box, rotation_about
@@ -23,6 +22,7 @@ from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, frames, load_
 from minisplat_ref.reference.covariance import covariances, rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Gaussians
 from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import AFFINE_EDIT, CLOSED_FORM, COVERAGE_MIN, EDITED_IMAGE, PARITY_FLOAT32_PROJECTION

@@ -10,7 +10,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.proxies import affine as edit_claims
 from data_tools.claims.proxies import sheet as sheet_claims
 from data_tools.claims.proxies.affine import roll, rolled_jacobian
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.extensions.proxies import fall as fall_command
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid

@@ -15,8 +15,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.rays import measures as claims
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -31,6 +30,7 @@ from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays, pixel_ray
 from minisplat_ref.mechanisms.rays.traversal import limits_of
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians, Model, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import (

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.rays import demo
 from data_tools.claims.rays import measures as claims
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import surroundings

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
 from data_tools.claims.satellite import boxes
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
@@ -21,6 +20,7 @@ from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
 from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Camera, Model, Optics, view_from

@@ -12,7 +12,7 @@ import pytest
 from test_satellite import make_rpc, text_of
 
 from data_tools.claims.satellite.measures import perspective_residual
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.satellite.rpc import read_rpc
 from minisplat_ref.extensions.satellite.training import read_images, read_suns

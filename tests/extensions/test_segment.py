@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 
 from data_tools.claims import segment as study
 from data_tools.claims.__main__ import main as measure_claim
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension

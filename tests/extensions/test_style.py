@@ -11,7 +11,7 @@ from PIL import Image
 from data_tools.claims import style as study
 from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene

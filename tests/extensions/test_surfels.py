@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from data_tools.claims import surfels as study
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.surfels import ARMS, outcome
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io.ply import load_ply

@@ -6,8 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims import texture_splat as study
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
@@ -39,6 +38,7 @@ from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Camera, Gaussians, Model, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64

@@ -11,8 +11,7 @@ from data_tools.claims.kit import read_scene
 from data_tools.claims.textured import colors_across
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
@@ -24,6 +23,7 @@ from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Model, Projection, view_from
 from payloads import drawn, random_textures
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera

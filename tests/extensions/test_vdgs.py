@@ -10,8 +10,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.vdgs import floats as floats_study
 from data_tools.claims.vdgs import pane as study
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
@@ -40,6 +39,7 @@ from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Gaussians, Model, Scene, view_from

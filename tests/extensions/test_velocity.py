@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.velocity import make_moving_gaussians, outcome, photographs
 from gradcheck import check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
@@ -22,7 +22,7 @@ from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import gaussian_splatting
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.runs.progress import Progress
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from

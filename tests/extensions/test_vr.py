@@ -10,8 +10,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.vr import foveation as measures
 from data_tools.claims.vr import queues
 from minisplat_ref import load_ply, save_ply
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -25,6 +24,7 @@ from minisplat_ref.mechanisms.tangent.renderer import prepare, render
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.reference.hits import blending_order
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Model, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM

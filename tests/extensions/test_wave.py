@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims.wave import measures as claims
 from data_tools.claims.wave.measures import facing, tilted
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.wave import blending, encoding, windows

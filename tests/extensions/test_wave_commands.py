@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from data_tools.claims.__main__ import main as measure_claim
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.extensions.wave import hologram_file
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image

@@ -18,7 +18,6 @@ import numpy as np
 from numba.cuda import dispatcher
 from numba.cuda.typing.typeof import Purpose, typeof
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.cuda import (
     adam,
@@ -35,6 +34,7 @@ from minisplat_ref.cuda import (
     tiling,
 )
 from minisplat_ref.cuda.target import GpuKernel, cuda
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import AdamStep, PrimitiveGradient, ProjectionGradient, SHGradient, TileGrid
 from scenes import activated, as_dtype, make_camera, make_gaussians
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, MINI_SPLATTING2, Conventions
+from minisplat_ref.rendering.backends import REFERENCE, Backend, get_backend
 from minisplat_ref.types import AdamStep, Primitives, ProjectionGradient, TileGrid
 from scenes import activated, as_dtype, make_camera, make_gaussians
 

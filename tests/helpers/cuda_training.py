@@ -12,9 +12,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, get_backend
 from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting
 from minisplat_ref.rendering import Renderer, render
+from minisplat_ref.rendering.backends import REFERENCE, get_backend
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from minisplat_ref.lpips import ALEXNET, Network, expected_shapes
+from minisplat_ref.metrics.lpips import ALEXNET, Network, expected_shapes
 
 
 def random_weights(rng, backbone=ALEXNET):

@@ -12,10 +12,10 @@ import ctypes
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, CPU_EXACT, PLAIN
 from minisplat_ref.jit.compile import kernel
 from minisplat_ref.oracle.hard_cases import HARD_CASES
 from minisplat_ref.oracle.hard_cases.subjects import render_subject
+from minisplat_ref.rendering.backends import CPU, CPU_EXACT, PLAIN
 
 ENVIRONMENT = {"GLIBC_TUNABLES": "glibc.malloc.tcache_count=0"}
 M_PERTURB = -6  # of mallopt: fill with the other byte, b ^ 0xff

@@ -5,8 +5,8 @@ import signal
 
 import pytest
 
-from minisplat_ref.cli import main
-from minisplat_ref.runs.progress import Progress
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.progress import Progress
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 20

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.bench import workloads
+from minisplat_ref.rendering.backends import CPU
 
 
 def tiny():

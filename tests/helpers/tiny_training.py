@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.types import Scene, View

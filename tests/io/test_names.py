@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from minisplat_ref import Gaussians, save_ply
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs import scoring
 from minisplat_ref.datasets.undistort import undistort_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, read_image, viewpoints
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.names import file_names, name_inside, path_beside
 from minisplat_ref.metrics import ViewMetrics
-from minisplat_ref.runs import scoring
 from minisplat_ref.types import number_views
 from photo_scenes import PINHOLE, colored_image, edit_transforms, write_colmap, write_transforms
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from minisplat_ref.app.film import check_film, write_film
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.film import check_film, write_film
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.orbits import orbit
 from minisplat_ref.io.viewpoints import Viewpoint

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from minisplat_ref import memory
-from minisplat_ref.backends import CPU
-from minisplat_ref.cli import main
-from minisplat_ref.comparison.crops import choose_crops
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.comparison.crops import choose_crops
+from minisplat_ref.app.runs import fingerprint, room, run_folder
+from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -26,8 +27,7 @@ from minisplat_ref.io.stored_views import Photograph, Pixels, ReadingAhead, Shel
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
-from minisplat_ref.runs import fingerprint, room, run_folder
-from minisplat_ref.runs.scoring import Trained
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
@@ -276,7 +276,7 @@ def test_evaluations_hold_no_more_than_they_show(scene, alive, monkeypatch):
 
 
 def hide_at(step, path, monkeypatch, change):
-    from minisplat_ref.runs.progress import Progress
+    from minisplat_ref.app.runs.progress import Progress
 
     report_step = Progress.__call__
 

@@ -13,16 +13,18 @@ from numba.core.registry import cpu_target
 
 import minisplat_ref
 from minisplat_ref import extensions
-from minisplat_ref import warm_up as warm_up_module
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs import first_use
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.extensions import warm_up as extensions_warm_up
+from minisplat_ref.extensions.warm_up import warm_up
 from minisplat_ref.jit import compile as _jit
 from minisplat_ref.jit.kernel_cache import kernel_folders
 from minisplat_ref.rendering import render
-from minisplat_ref.runs import first_use
-from minisplat_ref.warm_up import FIRST_ITERATION, STAGES, warm_up
+from minisplat_ref.rendering import warm_up as stages_module
+from minisplat_ref.rendering.backends import CPU, REFERENCE
+from minisplat_ref.rendering.warm_up import FIRST_ITERATION, STAGES
 from scenes import as_dtype, make_camera, make_gaussians
 
 PACKAGE = Path(minisplat_ref.__file__).parent
@@ -128,7 +130,7 @@ def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch
 def test_a_training_starts_without_plots_and_readers_of_other_scenes():
     code = """
 import sys
-import minisplat_ref.runs.settings, minisplat_ref.runs.run
+import minisplat_ref.app.runs.settings, minisplat_ref.app.runs.run
 print("LOADED", {"matplotlib", "pycolmap", "torch", "IPython"} & set(sys.modules))
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -141,7 +143,7 @@ UNDER_WATCH = """
 import gc, sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from minisplat_ref.backends import CPU
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.extensions.geometry import EXTENSION as GEOMETRY
 from minisplat_ref.io import load_scene
 from minisplat_ref.metrics import evaluate
@@ -149,7 +151,8 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.training.loop import train
-from minisplat_ref.warm_up import FIRST_ITERATION, STAGES, _draw_extension
+from minisplat_ref.extensions.warm_up import draw_extension
+from minisplat_ref.rendering.warm_up import FIRST_ITERATION, STAGES
 
 
 def signatures():
@@ -167,7 +170,7 @@ state = train(scene, recipe, seed=0)
 assert len(first) > 10 and signatures() == first, signatures() - first
 for compile_stage in STAGES.values():
     compile_stage(np.float32)
-_draw_extension(GEOMETRY, np.float32)
+draw_extension(GEOMETRY, np.float32)
 every = signatures()
 assert len(every) > len(first) + 5
 camera = scene.train_views[0].camera
@@ -191,7 +194,7 @@ def test_training_uses_what_was_compiled_ahead(tmp_path):
 
 def test_reference_gives_the_types_that_kernels_give(rng):
     gaussians, camera = as_dtype(make_gaussians(rng, 9), np.float32), make_camera()
-    both = (render(gaussians, camera, backend=b)[1].splats.projection for b in (CPU, warm_up_module._REFERENCE))
+    both = (render(gaussians, camera, backend=b)[1].splats.projection for b in (CPU, stages_module.TYPED_REFERENCE))
     assert [(a.dtype, a.flags.c_contiguous) for a in next(both)] == [
         (b.dtype, b.flags.c_contiguous) for b in next(both)
     ]
@@ -199,6 +202,11 @@ def test_reference_gives_the_types_that_kernels_give(rng):
 
 
 # --- processes and commands ---
+
+
+def only_adam(monkeypatch):
+    for module in (stages_module, extensions_warm_up):
+        monkeypatch.setattr(module, "STAGES", {"Adam": STAGES["Adam"]})
 
 
 def test_stages_are_compiled_by_other_processes(tmp_path, monkeypatch):
@@ -210,7 +218,7 @@ def test_stages_are_compiled_by_other_processes(tmp_path, monkeypatch):
 
 
 def test_warm_says_what_it_did(root, monkeypatch, capsys):
-    monkeypatch.setattr(warm_up_module, "STAGES", {"Adam": STAGES["Adam"]})
+    only_adam(monkeypatch)
     monkeypatch.setattr(extensions, "folders", dict)
     assert main(["cache", "warm"]) == 0
     captured = capsys.readouterr()
@@ -229,7 +237,7 @@ def test_warm_goes_on_after_a_broken_extension(root, tmp_path, monkeypatch, caps
         (package / "__init__.py").write_text(text)
     monkeypatch.setenv("MINISPLAT_EXTENSIONS", str(tmp_path / "mine"))  # for the other processes
     monkeypatch.setattr(extensions, "folders", lambda: dict.fromkeys(texts))
-    monkeypatch.setattr(warm_up_module, "STAGES", {"Adam": STAGES["Adam"]})
+    only_adam(monkeypatch)
     assert main(["cache", "warm"]) == 0
     captured = capsys.readouterr()
     warnings = sorted(line for line in captured.err.splitlines() if "warning" in line)
@@ -256,7 +264,7 @@ def test_warm_goes_on_where_two_extensions_have_one_name(root, tmp_path, monkeyp
     (tmp_path / "mine" / "velocity").mkdir(parents=True)
     (tmp_path / "mine" / "velocity" / "__init__.py").touch()
     monkeypatch.setattr(extensions, "__path__", [*extensions.__path__, str(tmp_path / "mine")])
-    monkeypatch.setattr(warm_up_module, "STAGES", {"Adam": STAGES["Adam"]})
+    only_adam(monkeypatch)
     assert main(["cache", "warm"]) == 0
     captured = capsys.readouterr()
     assert "minisplat-ref: warning: extension velocity is in" in captured.err and "1 of 1" in captured.err

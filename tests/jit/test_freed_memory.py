@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Model, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 

@@ -17,7 +17,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minisplat_ref
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -25,6 +24,7 @@ from minisplat_ref.extensions.geometry import kernels as geometry_kernels
 from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.jit import compile as _jit
 from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import AdamStep, ProjectionGradient, TileGrid
 from scenes import activated, as_dtype, make_camera, make_gaussians
 from tolerances import COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE
@@ -121,7 +121,7 @@ import sys
 import numba
 import numpy as np
 from test_kernels import drawn, small_view
-from minisplat_ref.backends import CPU
+from minisplat_ref.rendering.backends import CPU
 assert numba.config.DISABLE_JIT and not hasattr(numba.njit(lambda: 0), "signatures"), "kernels are compiled after all"
 np.savez(sys.argv[1], *drawn(*small_view(), CPU))
 """

@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.lens import COEFFICIENTS, Lens, optics_of
@@ -26,7 +25,8 @@ from minisplat_ref.mechanisms.cameras.models import (
 from minisplat_ref.mechanisms.cameras.unscented import COVARIANCE_WEIGHTS, MEAN_WEIGHTS, sigma_points, unscented
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole, pinhole_jacobians, pinhole_rays
-from minisplat_ref.splatting import splat
+from minisplat_ref.rendering.backends import CPU, REFERENCE
+from minisplat_ref.rendering.splatting import splat
 from minisplat_ref.types import Camera, Optics, Primitives, ProjectionGradient
 from scenes import ANTIALIASED, make_camera, turned_camera
 

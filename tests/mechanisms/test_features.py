@@ -6,11 +6,11 @@ from numpy.testing import assert_allclose
 
 from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref.errors import InputError
-from minisplat_ref.lpips import max_pool
 from minisplat_ref.mechanisms.features import network
 from minisplat_ref.mechanisms.features.bank import check_size
 from minisplat_ref.mechanisms.features.filters import CLASSICAL, ENERGY, EVEN, WAVELENGTH
 from minisplat_ref.mechanisms.features.layers import halve, halve_vjp, max_pool_vjp
+from minisplat_ref.metrics.lpips import max_pool
 from tolerances import CLOSED_FORM
 
 

@@ -6,7 +6,6 @@ from numpy.testing import assert_allclose
 from scipy.integrate import dblquad, quad
 
 from gradcheck import check_inner_products
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.gbuffer.brdf import hammersley, integrate, reflectance
@@ -18,6 +17,7 @@ from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface, shade, sha
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp, untone
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Model, Primitives
 from tolerances import CLOSED_FORM, ENVIRONMENT_TEXEL, PARITY_FLOAT64, SPLIT_SUM
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.gradients import inner_product_case
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians, Model, view_from
 from payloads import BACKGROUND, CASES, drawn, random_textures
 from scenes import as_dtype, make_camera, make_gaussians

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
@@ -17,6 +16,7 @@ from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request, activate
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Camera, Gaussians, Model, Primitives, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import (

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting, mini_splatting2
 from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
 from minisplat_ref.rendering import RenderSettings, render, render_vjp
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.ops import n_rows

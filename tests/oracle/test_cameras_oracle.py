@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.mechanisms.cameras.gsplat_call import STEPS
 from minisplat_ref.mechanisms.cameras.oracle.call import CALL, STAGES

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from minisplat_ref import gsplat_compat
-from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE
-from minisplat_ref.cli import main
-from minisplat_ref.cli.oracle import compare as compare_command
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.cli.oracle import compare as compare_command
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
+from minisplat_ref.gsplat import call as gsplat_compat
 from minisplat_ref.oracle.comparison.measures import difference
 from minisplat_ref.oracle.comparison.renderers import (
     ComparedRenderer,
@@ -29,6 +28,7 @@ from minisplat_ref.oracle.golden.format import SPECS
 from minisplat_ref.oracle.golden.running import reference_bins, run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.planted import PLANTED
+from minisplat_ref.rendering.backends import CPU, CPU_EXACT, REFERENCE
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.types import Projection
 from tolerances import PARITY_FLOAT64

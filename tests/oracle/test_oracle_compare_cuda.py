@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.renderers import choose_renderer, choose_scenes
@@ -14,7 +13,8 @@ from minisplat_ref.oracle.comparison.staged import compare_scene, first_divergen
 from minisplat_ref.oracle.golden.scenes import RECIPES
 from minisplat_ref.oracle.peers.cuda import from_functions, from_module, rules_of
 from minisplat_ref.reference.pinhole import pinhole
-from minisplat_ref.splatting import Primitives, splat, splat_vjp
+from minisplat_ref.rendering.backends import REFERENCE
+from minisplat_ref.rendering.splatting import Primitives, splat, splat_vjp
 from minisplat_ref.types import Camera, Projection, TileBins, TileGrid
 
 torch = pytest.importorskip("torch", reason="the extra minisplat_ref[peers] is not installed")

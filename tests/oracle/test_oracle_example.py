@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from minisplat_ref.cli.oracle.compare import SCENES
+from minisplat_ref.app.cli.oracle.compare import SCENES
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs" / "examples"

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minisplat_ref import gsplat_compat
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_1_5
 from minisplat_ref.errors import InputError
+from minisplat_ref.gsplat import call as gsplat_compat
 from minisplat_ref.oracle.peers.array_kinds import Call, kind_of, run
 from minisplat_ref.oracle.peers.function import from_function
 from minisplat_ref.testing import assert_matches_oracle
@@ -18,7 +18,7 @@ from minisplat_ref.testing import assert_matches_oracle
 SCENE = ("odd-size",)
 DOCS = Path(__file__).parents[2] / "docs"
 OURS = """
-from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
+from minisplat_ref.gsplat.call import rasterization, rasterization_vjp
 
 NUMBER = 3
 

@@ -7,8 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden import files
@@ -20,6 +19,7 @@ from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import slope_limits
 from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Gaussians
 from tolerances import COVERAGE_MIN, GRADIENT_FLOOR, PARITY_FLOAT64
 

@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from minisplat_ref import gsplat_compat
-from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
-from minisplat_ref.gsplat_arguments import RENDER_MODES
+from minisplat_ref.gsplat import call as gsplat_compat
+from minisplat_ref.gsplat.arguments import RENDER_MODES
 from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.differences import (
     CENTRAL,
@@ -36,7 +35,8 @@ from minisplat_ref.reference import projection as reference_projection
 from minisplat_ref.reference.depth import expected_depth_vjp
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_jacobians_vjp, slope_limits
-from minisplat_ref.splatting import splat_vjp
+from minisplat_ref.rendering.backends import BACKENDS, CPU, REFERENCE
+from minisplat_ref.rendering.splatting import splat_vjp
 from minisplat_ref.types import TileGrid
 from tolerances import CLOSED_FORM
 

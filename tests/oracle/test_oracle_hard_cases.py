@@ -4,8 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
@@ -21,6 +20,7 @@ from minisplat_ref.oracle.hard_cases.run import (
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, render_subject
 from minisplat_ref.oracle.tolerances import ORDINARY
 from minisplat_ref.rendering import render_vjp
+from minisplat_ref.rendering.backends import BACKENDS, CPU, REFERENCE
 
 BY_NAME = {case.name: case for case in HARD_CASES}
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions import extension
 from minisplat_ref.oracle.models import check_model_gradients, model_stage
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.stages import project_stage
 from minisplat_ref.rendering import SPLATTING, Renderer
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.types import Gaussians, Model

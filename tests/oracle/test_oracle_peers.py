@@ -5,7 +5,6 @@ import importlib.util
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import gradients
@@ -14,6 +13,7 @@ from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import PEER_REL
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import TileGrid
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("torch", "gsplat"))

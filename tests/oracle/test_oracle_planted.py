@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.geometry.stages import PIECES as GEOMETRY_PIECES
@@ -14,6 +13,7 @@ from minisplat_ref.oracle.planted import PLANTED, plant
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import ProjectionGradient, TileGrid
 from mutants import mutants
 

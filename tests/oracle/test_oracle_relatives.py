@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref import extensions
-from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions import extension
 from minisplat_ref.extensions.cuts import kernels as cut_kernels
@@ -24,6 +23,7 @@ from minisplat_ref.oracle.loss_terms import loss_cases, loss_stage, own_terms
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.relatives import Relative, check_relative_gradients
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.training.calibration import EXPOSURES, expose_vjp
 from minisplat_ref.training.losses import Cotangents, LossTerm
 from minisplat_ref.training.representation import GAUSSIANS

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from data_tools import signatures as measuring
-from minisplat_ref import gsplat_compat
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.gsplat import call as gsplat_compat
 from minisplat_ref.oracle.comparison import signatures
 from minisplat_ref.oracle.comparison.measures import Difference
 from minisplat_ref.oracle.comparison.signatures import Mark, Trace, distance, likeliest, mark, signature

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.hard_cases.scenes import camera, gaussians, rotation_quat
 from minisplat_ref.oracle.hard_cases.subjects import cast
@@ -11,6 +10,7 @@ from minisplat_ref.oracle.thresholds import thresholds, thresholds_of_view
 from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, IMAGE, OWN_KERNELS
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Projection, TileGrid
 
 ULP = float(np.spacing(np.float32(3)))

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import truth
 from minisplat_ref.reference.covariance import rotation_matrices

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import BACKENDS, CPU
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.oracle import replay as replaying
+from minisplat_ref.rendering.backends import BACKENDS, CPU
 from minisplat_ref.training.guard import BadNumbers, Guard
 from minisplat_ref.training.loop import train
 from tiny_training import RECIPE, scene  # noqa: F401  (a fixture)

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.surfels.gsplat_call import NAMES, rasterization_2dgs, rasterization_2dgs_vjp
 from minisplat_ref.mechanisms.surfels.oracle.call import CALL, STAGES

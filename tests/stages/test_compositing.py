@@ -3,9 +3,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.reference.compositing import composite_all_pairs
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Projection, TileGrid
 from scenes import ALL_CONVENTIONS, activated, as_dtype, make_camera, make_gaussians
 from tolerances import (

@@ -3,10 +3,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp, surface_points, surface_points_vjp
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import REFERENCE
 from scenes import activated, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_FLOOR, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 

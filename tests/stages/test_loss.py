@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import correlate1d
 
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SSIM_C1, SSIM_C2
 from minisplat_ref.reference.loss import ssim_map, ssim_map_vjp
+from minisplat_ref.rendering.backends import REFERENCE
 from tolerances import CLOSED_FORM, GRADIENT_FLOOR, PARITY_FLOAT32_LOSS, PARITY_FLOAT64, SSIM_BY_SCIPY
 
 ROOT = Path(__file__).parents[2]
@@ -182,7 +182,7 @@ AT_ANY_NUMBER_OF_THREADS = """
 import hashlib
 import numba
 import numpy as np
-from minisplat_ref.backends import CPU
+from minisplat_ref.rendering.backends import CPU
 
 rng = np.random.default_rng(0)
 for dtype in (np.float32, np.float64):

@@ -4,7 +4,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref import constants
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, INRIA
 from minisplat_ref.reference.pinhole import (
     pinhole,
@@ -17,6 +16,7 @@ from minisplat_ref.reference.pinhole import (
     slope_limits,
 )
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Model, ProjectionGradient, TileGrid, view_from
 from scenes import (
     ALL_CONVENTIONS,

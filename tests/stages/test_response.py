@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products
-from minisplat_ref.backends import CPU, CPU_EXACT, PLAIN, REFERENCE
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, INRIA, LIST_ORDER, MINI_SPLATTING2
 from minisplat_ref.cpu.compositing import hits as plain
 from minisplat_ref.cpu.compositing.exponential import exp_exact
@@ -19,6 +18,7 @@ from minisplat_ref.jit.lanes import load, maximum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 from minisplat_ref.reference import compositing, removal
 from minisplat_ref.reference.hits import CONIC, Hit, Response, blending_order, tile_hits
+from minisplat_ref.rendering.backends import CPU, CPU_EXACT, PLAIN, REFERENCE
 from minisplat_ref.types import Floats, Ints, Projection, TileGrid
 from scenes import ALL_CONVENTIONS, activated, as_dtype, make_camera, make_gaussians
 from tolerances import (

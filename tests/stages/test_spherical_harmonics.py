@@ -3,9 +3,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
+from minisplat_ref.rendering.backends import REFERENCE
 from scenes import make_camera, make_gaussians
 from tolerances import (
     CLOSED_FORM,

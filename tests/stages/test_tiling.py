@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Projection, TileGrid
 from scenes import activated, make_camera, make_gaussians
 from tolerances import PARITY_FLOAT32_IMAGE

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite_all_pairs
 from minisplat_ref.rendering import RenderSettings, render
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.types import View
 from scenes import activated, make_camera, make_gaussians

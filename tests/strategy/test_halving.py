@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.halving import halves, thin_logits
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite_all_pairs
 from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy.importance import ImportanceStats, collect_importance, indoor, mass_mask, outdoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.types import view_from

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, render, render_vjp
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy.removal import RemovalCosts, collect_removal_costs, worth_their_place
 from minisplat_ref.types import Model, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians

@@ -13,12 +13,12 @@ from data_tools.claims import pose as poses_study
 from data_tools.claims.exposure import EXPOSURE
 from data_tools.claims.pose import POSE
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.calibration import (
     ANGLE_MIN,
     EXPOSURES,

@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.backends import CPU
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods.adaptive import exposure
@@ -16,6 +15,7 @@ from minisplat_ref.methods.adaptive.evidence import Evidence
 from minisplat_ref.methods.adaptive.numbers import GAIN_MIN
 from minisplat_ref.methods.adaptive.switches import switch_antialiasing_on, switch_exposure_on
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation
 from minisplat_ref.training.pace import Pace

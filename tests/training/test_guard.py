@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import save_checkpoint
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.case import load_case
 from minisplat_ref.training.guard import BadNumbers, Guard, examine
 from minisplat_ref.training.initial_state import initial_state

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.errors import InputError
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training import interruption
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.interruption import Interruptions, terminated_like_interrupted

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.geometry import EXTENSION as GEOMETRY
 from minisplat_ref.extensions.geometry import kernels
@@ -19,6 +18,7 @@ from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, render
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import LogLinear

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
@@ -20,6 +19,7 @@ from minisplat_ref.io.checkpoint import load_checkpoint
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.clone_split import clone_and_split
 from minisplat_ref.strategy.importance import indoor, outdoor
 from minisplat_ref.strategy.ops import take

@@ -7,12 +7,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0, SH_C1
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.calibration import with_exposures
 from minisplat_ref.training.schedule import as_trained
 from minisplat_ref.training.sky import SKY, TRANSMITTANCE_MIN, clear_sky, with_sky

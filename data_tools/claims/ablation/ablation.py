@@ -23,11 +23,11 @@ from data_tools.claims.ablation.variants import ACTIONS, DEVIATIONS, FULL, MECHA
 from data_tools.claims.kit.conditions import get_condition
 from data_tools.claims.kit.figures import plus_minus, summarise
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import BLUE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Scene

@@ -26,7 +26,6 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import set_ticks, summarise, with_deviation
 from data_tools.claims.kit.objects import OBJECTS, mean_iou, object_ids
-from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.cus.bank import feature_error, first_keys, read_vjp
 from minisplat_ref.extensions.cus.decoding import decode
@@ -35,12 +34,13 @@ from minisplat_ref.extensions.cus.maps import feature_map
 from minisplat_ref.extensions.cus.method import ANCHORS, CUS, LATENT
 from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, QUERY, Anchors
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.interface.palette import BLUE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.features.blending import blend_channels, blend_channels_vjp
 from minisplat_ref.mechanisms.networks.networks import COMPILED
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, Request, activate
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, RED
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
 from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
 from minisplat_ref.types import Floats, Ints, Model, Scene, View

@@ -28,8 +28,8 @@ from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.cus.growth import THRESHOLD, grow_anchors
 from minisplat_ref.extensions.cus.method import LATENT
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.training.schedule import Recipe, configure, without
 
 POINTS = (2_000, 300)  # that trainings begin with; the first is as in cus/floats

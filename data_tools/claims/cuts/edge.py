@@ -17,8 +17,8 @@ from data_tools.claims import kit
 from data_tools.claims.cuts import card
 from data_tools.claims.kit.figures import plot_deviations, show, with_deviation
 from minisplat_ref.errors import InputError
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Bools, Floats
 
 NAMES, COLORS = ("no curve", "1 curve", "2 curves"), (GREY, RED, BLUE)  # by the number of curves

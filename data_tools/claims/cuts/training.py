@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.cuts import card
 from data_tools.claims.kit.figures import beside_images, plot_deviations, with_deviation
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import GREY, RED
+from minisplat_ref.interface.palette import GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 
 NUMBERS = {"plain": (1, 3, 6, 12), "cut": (1, 3, 6)}
 COLORS = {"plain": GREY, "cut": RED}

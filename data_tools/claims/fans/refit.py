@@ -21,9 +21,9 @@ from data_tools.claims.fans.profile import profile_error
 from data_tools.claims.kit.figures import mean_and_deviation, show, table_of, with_deviation
 from minisplat_ref.extensions.fans.shapes import FanShape
 from minisplat_ref.extensions.fans.tuning import render_clipped
-from minisplat_ref.progress import progress_bar
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.progress import progress_bar
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Scene
 
 KNOWN = ((2.5, 0.0), (2.3, 0.2), (2.7, 0.2))  # the best fan of 8 sides, and two that are used

@@ -9,7 +9,7 @@ import argparse
 from data_tools.claims import kit
 from data_tools.claims.kit.counts import Curve, measure_curves
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.reports.palette import GREY, RED
+from minisplat_ref.interface.palette import GREY, RED
 
 _THRESHOLDS = tuple({"threshold": threshold} for threshold in (2e-4, 4e-4, 8e-4))  # in normalised device coordinates
 CURVES = {name: Curve(name, _THRESHOLDS, color) for name, color in (("3dgs-accel", GREY), ("gdgs", RED))}

@@ -14,9 +14,9 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import with_deviation
 from minisplat_ref.extensions.gdgs.method import N_CELLS, N_TOP, on_planes, spacing_of
 from minisplat_ref.extensions.gdgs.reference import Weights, attract, contract, densest, disperse, regions_of
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.oriented.planes import fit_planes
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between, normals_of
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.types import Floats, Gaussians
 
 N_POINTS, NOISE = 2000, 0.05  # of a unit sphere

@@ -23,12 +23,12 @@ from data_tools.claims.kit.figures import STYLE
 from data_tools.claims.kit.records import resume as resume
 from minisplat_ref.datasets.named_scenes import read_scene as read_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import PNG_DPI
+from minisplat_ref.interface.progress import progress_bar
+from minisplat_ref.interface.progress import with_progress as with_progress  # which studies take from here
+from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io import load_ply, viewpoints
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.progress import progress_bar
-from minisplat_ref.progress import with_progress as with_progress  # which studies take from here
-from minisplat_ref.reporting import describe_machine
-from minisplat_ref.reports.palette import PNG_DPI
 from minisplat_ref.training.fine_tuning import fine_tune as fine_tune
 from minisplat_ref.training.fine_tuning import without_events as without_events
 from minisplat_ref.training.representation import floats_of as floats_of

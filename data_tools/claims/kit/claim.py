@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from minisplat_ref.arguments import SYNTHETIC_SCENES, add_number, integer, list_of, name
+from minisplat_ref.interface.arguments import SYNTHETIC_SCENES, add_number, integer, list_of, name
 
 Argument = Callable[[argparse._ActionsContainer], Any]  # adds itself to a parser
 NAMES = list_of(name)

@@ -15,9 +15,9 @@ from matplotlib.ticker import LogLocator
 from data_tools.claims import kit
 from data_tools.claims.kit.detail import quality
 from data_tools.claims.kit.figures import with_deviation
-from minisplat_ref.backends import CPU
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.schedule import Recipe, configure
 from minisplat_ref.types import NOTHING, Scene
 

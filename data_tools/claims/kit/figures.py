@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import GRID_COLOR
+from minisplat_ref.interface.palette import GRID_COLOR
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Floats
 
 if TYPE_CHECKING:

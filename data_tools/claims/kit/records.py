@@ -12,12 +12,12 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
+from minisplat_ref.app.runs import cluster
+from minisplat_ref.app.runs.cluster import Workers
+from minisplat_ref.app.runs.worker import Job, unless_exists
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import replacing
-from minisplat_ref.progress import with_progress
-from minisplat_ref.runs import cluster
-from minisplat_ref.runs.cluster import Workers
-from minisplat_ref.runs.worker import Job, unless_exists
 
 RUNS = "runs.jsonl"  # what has been measured so far, below the settings
 
@@ -71,7 +71,7 @@ def hand_out(workers: Workers, words: list[str], program: str, noun: str = "trai
     ------
     InputError
         From the function that is returned: a job has failed, or as for
-        :func:`minisplat_ref.runs.cluster.carry_out_all`.
+        :func:`minisplat_ref.app.runs.cluster.carry_out_all`.
     """
 
     def carry_out(folder: Path, numbers: Sequence[int]) -> None:

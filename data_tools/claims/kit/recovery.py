@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from data_tools.claims import kit
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.palette import BLUE, EDGE_COLOR, GREY, RED
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.reports.palette import BLUE, EDGE_COLOR, GREY, RED
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Scene
 

@@ -28,12 +28,12 @@ from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.tracer import World, points_along, radiance
 from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.lens import Lens, undistort
 from minisplat_ref.mechanisms.cameras.models import PERSPECTIVE, model_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Renderer, Request
-from minisplat_ref.reporting import describe_machine, markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
 from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Bools, Camera, Floats, Model, Optics, Scene, View, number_views, view_from
 

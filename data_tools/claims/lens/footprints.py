@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import table_of
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.interface.palette import BLUE, GREEN, GREY, RED
 from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
 from minisplat_ref.mechanisms.cameras.ray_footprints import hit, project
 from minisplat_ref.mechanisms.cameras.unscented import unscented
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.reports.palette import BLUE, GREEN, GREY, RED
 from minisplat_ref.types import Camera, Floats, Optics, Primitives
 
 ANGLES = {"pinhole": (0.0, 15.0, 30.0, 45.0, 55.0), "fisheye": (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)}

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Floats, Gaussians, Scene, View, number_views
 
 N_GAUSSIANS, N_FRAMES, TEST_EVERY = 400, 25, 4

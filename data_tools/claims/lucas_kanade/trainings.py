@@ -20,17 +20,17 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import with_deviation
 from data_tools.claims.lucas_kanade.body import ARC, RADIUS, Body, camera_at, film, make_body
-from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.lucas_kanade.losses import blended_steps, next_view, rendered_flow
 from minisplat_ref.extensions.lucas_kanade.moving import moved
 from minisplat_ref.extensions.lucas_kanade.pyramid import optical_flow
 from minisplat_ref.extensions.lucas_kanade.reference import image_steps
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.motion.field import basis, choose_centers, powers
 from minisplat_ref.mechanisms.motion.velocity import Warp, canonical_velocity, integrate, invert, velocity_of_backward
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, Request
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Bools, Floats, Model, Scene, View
 

@@ -9,7 +9,7 @@ import argparse
 from data_tools.claims import kit
 from data_tools.claims.kit.counts import Curve, measure_curves
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.interface.palette import BLUE, GREY, RED
 
 THRESHOLDS = (2e-4, 4e-4, 8e-4, 1.6e-3)  # in normalised device coordinates
 _LIMITS = tuple({"trace_limit": limit} for limit in (0.05, 0.1, 0.2))

@@ -19,11 +19,11 @@ from minisplat_ref.datasets.synthetic import SCENE_NAMES
 from minisplat_ref.extensions.mixed.method import MIXED as RECIPE
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simplify_hulls
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import describe_machine, markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.training.schedule import Recipe, action_name, scale_recipe
 from minisplat_ref.types import Scene

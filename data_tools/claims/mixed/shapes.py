@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import beside_images, with_deviation
 from data_tools.claims.mixed import fit
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Floats
 
 ENOUGH = 30.0  # dB

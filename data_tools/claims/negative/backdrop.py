@@ -16,12 +16,12 @@ from scipy.special import erf
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import show
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.negative.method import SIGNED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.ops import concat
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, View, view_from
 

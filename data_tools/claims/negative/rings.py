@@ -19,8 +19,8 @@ from scipy.special import erf, expit, logit
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import plot_band, show, with_deviation
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, LIGHT_BLUE, MIDDLE_BLUE, OCHRE, RED
+from minisplat_ref.interface.palette import BLUE, LIGHT_BLUE, MIDDLE_BLUE, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Floats
 
 OUTER = 0.7  # radius; the image is the square from -1 to 1

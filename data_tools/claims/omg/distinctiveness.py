@@ -22,10 +22,10 @@ from data_tools.claims.kit.figures import plot_deviations, set_ticks, with_devia
 from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import intersection_preserving, most_important

@@ -17,11 +17,11 @@ from minisplat_ref.extensions.extension import all_formats, find_recipe
 from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.method import OMG
 from minisplat_ref.extensions.omg.pack import read_training
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.training.representation import WORLD_UNITS
 from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, Scene
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import table_of
-from minisplat_ref.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.polygons.geometry import polygons_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.extensions.polygons.ray_kernels import tree_of
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.rendering.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.types import Camera, Gaussians, Model, View, view_from
 
 WIDTH, HEIGHT = 240, 135  # pixels

@@ -24,19 +24,19 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import set_ticks, show, table_of
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.polygons.kernels import TRIANGLE, Fans, tree_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, soup_of
+from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.mechanisms.meshes.fans import Flat, by_gram_schmidt, fit_flat_gaussians, fit_spans, flatten, rims
 from minisplat_ref.mechanisms.rays.kernels import tracer_of
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import Request
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from
 
 TURN = rotation_matrices(np.array([[0.8, 0.2, -0.4, 0.4]]))[0]

@@ -21,18 +21,18 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import set_ticks, show, table_of
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, rotation_about
 from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform, polar_rotations
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 MAPS = {

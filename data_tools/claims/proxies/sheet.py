@@ -29,10 +29,10 @@ from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
 from minisplat_ref.extensions.proxies.mass_spring import Energies, Sheet, State, energies, integrate, longest_step
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
+from minisplat_ref.interface.palette import BLUE, GREEN, RED
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import render
-from minisplat_ref.reports.palette import BLUE, GREEN, RED
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 GRAVITY = np.array([0.0, 9.81, 0.0])

@@ -5,12 +5,12 @@ Camera frame and world are the same: x right, y down, z forward.
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.rays.lights import World
 from minisplat_ref.extensions.rays.method import tracer_for, whiten_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Floats, Gaussians, Model
 
 CENTRE, RADIUS, N_BALL = np.array([-0.4, 0.2, 4.0]), 0.6, 300

@@ -10,19 +10,19 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import show, table_of
 from data_tools.claims.rays import demo
-from minisplat_ref.backends import CPU, PLAIN, REFERENCE
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.extensions.rays.kernels import tree_of
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
+from minisplat_ref.interface.palette import BLUE, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, OCHRE, RED
+from minisplat_ref.rendering.backends import CPU, PLAIN, REFERENCE
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, TileBins, TileGrid, view_from
 
 SIGMAS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)  # of a Gaussian over its distance

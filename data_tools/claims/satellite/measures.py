@@ -13,8 +13,8 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite.affine_fit import fit_residual
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.extensions.satellite.surface_model import surface_model
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import Request
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.schedule import Recipe

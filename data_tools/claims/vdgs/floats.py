@@ -16,11 +16,11 @@ from data_tools.claims.vdgs.pane import floats_of
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
+from minisplat_ref.interface.palette import BLUE
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE
 from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
 from minisplat_ref.types import Scene
 

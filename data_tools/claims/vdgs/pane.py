@@ -23,17 +23,17 @@ from numpy.typing import NDArray
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import summarise, with_deviation
-from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT, as_seen
+from minisplat_ref.interface.palette import BLUE, OCHRE, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.networks.directions import directions
 from minisplat_ref.mechanisms.networks.networks import COMPILED
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, OCHRE, RED
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configure, scale_recipe

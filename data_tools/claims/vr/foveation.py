@@ -11,16 +11,16 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.vr import queues
-from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
+from minisplat_ref.interface.palette import BLUE, GREY, RED
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io import load_ply
 from minisplat_ref.mechanisms.tangent.rays import color_changes, ewa_hits, tangent_hits, yaw_camera
 from minisplat_ref.mechanisms.tangent.renderer import prepare
 from minisplat_ref.rendering import Request, activate
-from minisplat_ref.reporting import markdown_table
-from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 
 EVERYWHERE = 180.0  # degrees: every pixel is drawn

@@ -28,9 +28,9 @@ from minisplat_ref.extensions.wave.blending import Scene, front_to_back
 from minisplat_ref.extensions.wave.hologram import blend_fast
 from minisplat_ref.extensions.wave.reference import Complexes, Flats, rayleigh_sommerfeld, spectra
 from minisplat_ref.extensions.wave.sampling import Grid, field_from, grid_waves, propagate
+from minisplat_ref.interface.palette import BLUE, GREEN, OCHRE, RED
+from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.reporting import describe_machine
-from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, RED
 from minisplat_ref.types import Floats
 
 GREEN_LIGHT = 520e-9  # metres

@@ -23,11 +23,11 @@ from minisplat_ref.extensions.wave.hologram import BLENDING, PITCH, THICKNESS, W
 from minisplat_ref.extensions.wave.hologram_file import Hologram
 from minisplat_ref.extensions.wave.placement import place, steepest_slope
 from minisplat_ref.extensions.wave.sampling import Grid
+from minisplat_ref.interface.palette import BLUE, GREEN, RED
+from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io.ply import read_label
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.reporting import describe_machine
-from minisplat_ref.reports.palette import BLUE, GREEN, RED
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from
 
 THIN = 1e-7  # metres

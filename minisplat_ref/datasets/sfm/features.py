@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.datasets.sfm.photographs import Photographs
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.lens import import_quiet_pycolmap
-from minisplat_ref.progress import progress_bar
 
 SEED = 0  # of RANSAC: the same photographs give the same matches
 NEIGHBOURS = (*range(1, 11), 16, 32, 64, 128, 256, 512)  # distances in the order of names, for sequential matching

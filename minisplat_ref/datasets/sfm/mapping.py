@@ -12,8 +12,8 @@ no camera, but training can start from them.
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.lens import import_quiet_pycolmap
-from minisplat_ref.progress import progress_bar
 
 SEED = 0
 SEEN_MIN = 15  # points with three views or more that a photograph must see for its camera to be credible

@@ -17,6 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from minisplat_ref.datasets.photo_files import MASKS, enumerate_names, list_images
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.images import (
     MASK_THRESHOLD,
     SAVE_OPTIONS,
@@ -26,7 +27,6 @@ from minisplat_ref.io.images import (
     resize_mask,
     write_image,
 )
-from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Bools
 
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)

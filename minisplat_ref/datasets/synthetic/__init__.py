@@ -82,7 +82,7 @@ def make_scene(
         In walking order the first of this many views is a test view, like in loaders; 0 for no test views.
     progress : callable
         Wraps the sequence of cameras while the views are traced;
-        :func:`~minisplat_ref.progress.with_progress` shows a bar.
+        :func:`~minisplat_ref.interface.progress.with_progress` shows a bar.
 
     Returns
     -------

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.extensions.analytic.kernels import response_for
@@ -13,6 +12,7 @@ from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.removal import removal_changes_of_hits
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import CompositeGradient, Floats, Model, Projection, RenderOutput, TileBins, View
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.extensions.analytic.method import INTEGRATED
 from minisplat_ref.extensions.analytic.reference import RESPONSE
 from minisplat_ref.oracle.differences import Point
@@ -10,6 +9,7 @@ from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import Floats, TileGrid
 
 

@@ -41,9 +41,9 @@ from minisplat_ref.extensions.compression.levels8 import (
     with_largest,
     without_largest,
 )
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.formats import Format
 from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 VERSION = 2

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.cus.bank import feature_error, read, read_vjp
 from minisplat_ref.extensions.cus.decoding import decode
 from minisplat_ref.extensions.cus.losses import (
@@ -33,6 +32,7 @@ from minisplat_ref.oracle.models import model_stage, noisy_model, training_view
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage, watch
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.losses import Cotangents
 from minisplat_ref.training.rates import Rates

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.cuts.curve import N_EDGES, N_PIECES, TOPS
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.mechanisms.payload.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats, Gaussians
 
 

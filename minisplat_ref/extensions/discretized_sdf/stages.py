@@ -4,7 +4,6 @@ from functools import partial
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.discretized_sdf.method import DISTANCED, render
 from minisplat_ref.extensions.discretized_sdf.reference import (
     opacity_logits,
@@ -17,6 +16,7 @@ from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:

@@ -4,10 +4,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.arguments import add_number
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.arguments import add_shape, load_as_fans, shape_of
-from minisplat_ref.progress import progress_bar
+from minisplat_ref.interface.arguments import add_number
+from minisplat_ref.interface.progress import progress_bar
 
 EPILOG = """\
 example:

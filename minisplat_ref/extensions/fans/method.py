@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians, mesh_of, mesh_of_vjp
 from minisplat_ref.io.frames import Unit
@@ -20,6 +19,7 @@ from minisplat_ref.mechanisms.peeling.layers import ALL_LAYERS, Frame, Peeled, T
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation

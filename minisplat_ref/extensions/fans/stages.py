@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, render
 from minisplat_ref.extensions.fans.shapes import Fans
 from minisplat_ref.oracle.differences import Point
@@ -10,6 +9,7 @@ from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import Floats, Model, view_from
 
 

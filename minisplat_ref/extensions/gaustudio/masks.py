@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.extensions.gaustudio.sky_masks import by_color
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import load_scene, write_image
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.progress import with_progress
 
 EPILOG = """\
 example:

@@ -5,13 +5,13 @@ from functools import partial
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.gaustudio import backgrounds, representations
 from minisplat_ref.extensions.gaustudio.backgrounds import Background, white_ball
 from minisplat_ref.extensions.gaustudio.method import STUDIO, render
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.sky import SKY, clear_sky
 from minisplat_ref.types import Floats

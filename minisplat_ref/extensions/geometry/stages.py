@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.geometry import depth_map, kernels, reference
 from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.oracle.differences import Point
@@ -15,6 +14,7 @@ from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Camera, Floats
 
 

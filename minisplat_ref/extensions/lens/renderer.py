@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
@@ -20,7 +19,8 @@ from minisplat_ref.mechanisms.cameras.ray_footprints import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
-from minisplat_ref.splatting import append_depths
+from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.rendering.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
     Floats,

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
 from minisplat_ref.extensions.lens.renderer import prepare
 from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE
@@ -12,6 +11,7 @@ from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import Floats, Gaussians, Model, Optics
 
 OPTICS = (

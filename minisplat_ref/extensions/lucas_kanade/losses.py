@@ -29,7 +29,7 @@ from minisplat_ref.mechanisms.motion.field import field, field_vjp
 from minisplat_ref.mechanisms.motion.velocity import power_steps
 from minisplat_ref.reference.pinhole import pose, project_into_image, with_principal_point
 from minisplat_ref.rendering import Request, activate, parameters_vjp
-from minisplat_ref.splatting import SplatTape, splat, splat_vjp
+from minisplat_ref.rendering.splatting import SplatTape, splat, splat_vjp
 from minisplat_ref.training.losses import Cotangents, Rendered
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Scene, SHGradient, View
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.lucas_kanade.losses import SHAPE, rendered_flow, rendered_flow_vjp
 from minisplat_ref.extensions.lucas_kanade.method import WARPED
 from minisplat_ref.oracle.differences import Point
@@ -10,6 +9,7 @@ from minisplat_ref.oracle.models import TIME, noisy_model, training_view
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage, watch
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats, Model
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.micro.reference import trace_penalty, trace_penalty_vjp, traces
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats
 
 

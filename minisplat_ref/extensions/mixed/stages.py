@@ -5,7 +5,6 @@ Recorded are the edges on which pixels' hits lie, and which depths are bounded.
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
 from minisplat_ref.extensions.mixed.response import INSIDE
@@ -14,6 +13,7 @@ from minisplat_ref.mechanisms.payload.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints
 
 SPAN = 1.0  # of the vertices from the first, in the Gaussians' own deviations

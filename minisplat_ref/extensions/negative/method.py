@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.negative.reference import negate
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, RenderOutput, SHGradient, View
 

@@ -6,7 +6,6 @@ The networks are as those of the recipe, but small: every weight is checked. Pla
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.omg.decoding import gather, run_networks, split_codes
 from minisplat_ref.extensions.omg.population import (
     COLOR,
@@ -25,6 +24,7 @@ from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.types import Floats, Gaussians
 

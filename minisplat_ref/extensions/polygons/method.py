@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
 from minisplat_ref.extensions.polygons.ray_kernels import POLYGON, tree_of
@@ -12,6 +11,7 @@ from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Gaussians
 

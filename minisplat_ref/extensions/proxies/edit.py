@@ -17,10 +17,10 @@ from minisplat_ref.extensions.proxies.affine import (
     rotation_about,
 )
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
-from minisplat_ref.progress import with_progress
 from minisplat_ref.types import Bools, Floats
 
 DESCRIPTION = """\

@@ -21,13 +21,13 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     longest_step,
 )
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import orbits, viewpoints
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, load_mesh, save_mesh
-from minisplat_ref.progress import with_progress
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Camera, Floats
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import check_same_faces, load_mesh
-from minisplat_ref.progress import with_progress
 
 DESCRIPTION = """\
 Bind the Gaussians of a model to a mesh, and write them deformed as the mesh was

@@ -71,7 +71,7 @@ def nearest_triangles(
     mesh : Mesh
         It has at least one triangle, and every triangle has an area.
     progress : callable
-        Wraps the batches in which points are searched; :func:`~minisplat_ref.progress.with_progress` shows a bar.
+        Wraps the batches in which points are searched, as :func:`~minisplat_ref.interface.progress.with_progress`.
     """
     points = points.astype(np.float64)
     centres = mesh.corners.mean(axis=1)  # [T, 3]

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.kernels import RESPONSE, tree_of
@@ -13,6 +12,7 @@ from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import surroundings
 from minisplat_ref.extensions.rays.lights import World, shade
 from minisplat_ref.extensions.rays.method import tracer_for, whiten_model
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.label import warn_of_another
@@ -19,7 +19,7 @@ from minisplat_ref.io.names import file_names
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.io.run_files import CAMERAS, model_file
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
-from minisplat_ref.progress import with_progress
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Floats, Model
 
 ORBIT_SIZE = (320, 240)  # pixels

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.rays.geometry import whiten
 from minisplat_ref.extensions.rays.method import TRACED
 from minisplat_ref.extensions.rays.reference import prepare_meeting
@@ -12,6 +11,7 @@ from minisplat_ref.mechanisms.rays.blending import Meeting
 from minisplat_ref.mechanisms.rays.stages import trace_stages
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats
 
 

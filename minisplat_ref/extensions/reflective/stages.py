@@ -4,7 +4,6 @@ from functools import partial
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.reflective.method import SHADED
 from minisplat_ref.mechanisms.gbuffer.population import PER_SURFEL, WITH_OCCLUSION
 from minisplat_ref.mechanisms.gbuffer.renderer import render
@@ -12,6 +11,7 @@ from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats
 
 

@@ -24,7 +24,7 @@ from minisplat_ref.extensions.satellite.reference import (
 )
 from minisplat_ref.mechanisms.cameras.affine import AffineCamera, orthographic, with_affine
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, parameters_vjp
-from minisplat_ref.splatting import SplatGradient, SplatTape, splat, splat_vjp
+from minisplat_ref.rendering.splatting import SplatGradient, SplatTape, splat, splat_vjp
 from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
 
 RADIOMETRY, IN_SHADOW = "radiometry", "in_shadow"  # shared: [V, 3, 4] and [V, 3]

@@ -10,7 +10,6 @@ less than :data:`TIE` apart counts as equal.
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.satellite.affine_fit import AFFINE
 from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE
@@ -21,6 +20,7 @@ from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Camera, Floats, Model, Optics, RenderOutput, View
 
 ALL = frozenset(CHANNELS)

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.arguments import HelpFormatter, positive
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.satellite.affine_fit import camera_of
 from minisplat_ref.extensions.satellite.renderer import SATELLITE
 from minisplat_ref.extensions.satellite.rpc import import_rasterio
+from minisplat_ref.interface.arguments import HelpFormatter, positive
 from minisplat_ref.io import write_image
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.ply import load_ply

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.arguments import HelpFormatter, integer, list_of
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.satellite.affine_fit import camera_of, check_altitudes, fit_rpc, frame_of
 from minisplat_ref.extensions.satellite.rpc import read_rpc
 from minisplat_ref.extensions.satellite.surface_model import FRAME
+from minisplat_ref.interface.arguments import HelpFormatter, integer, list_of
+from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io import save_ply
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import image_size, read_image
 from minisplat_ref.io.label import Label
-from minisplat_ref.progress import progress_bar
 from minisplat_ref.types import Frame, Scene, View
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")

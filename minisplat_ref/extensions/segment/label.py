@@ -11,8 +11,8 @@ from minisplat_ref.extensions.segment.assignment import UNSEEN, belongs, labels
 from minisplat_ref.extensions.segment.maps import read_masks
 from minisplat_ref.extensions.segment.model import read_subject, save_labelled, save_part
 from minisplat_ref.extensions.segment.votes import Votes, count_votes
-from minisplat_ref.progress import with_progress
-from minisplat_ref.reporting import markdown_table
+from minisplat_ref.interface.progress import with_progress
+from minisplat_ref.interface.reporting import markdown_table
 
 DESCRIPTION = """\
 Give every Gaussian a label, from masks of some photographs: NAME.png for the

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.model import read_labels, read_subject
+from minisplat_ref.interface.palette import SERIES
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import write_image
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.progress import with_progress
-from minisplat_ref.reports.palette import SERIES
 from minisplat_ref.types import Ints
 
 EPILOG = """\

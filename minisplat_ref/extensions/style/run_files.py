@@ -1,6 +1,6 @@
 """A run read to be styled, and the run that comes of it: its files, without the application that wrote them.
 
-Extensions are below :mod:`minisplat_ref.runs`, so this reads ``config.json`` itself. What it writes is an ordinary run
+Extensions are below :mod:`minisplat_ref.app`, so this reads ``config.json`` itself. What it writes is an ordinary run
 without a checkpoint, like that of ``simplify``: ``render``, ``eval``, ``info`` and ``convert`` take it.
 """
 

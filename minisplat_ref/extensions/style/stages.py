@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.style.reference import (
     FeatureWeights,
     feature_loss,
@@ -17,6 +16,7 @@ from minisplat_ref.mechanisms.features.layers import max_pool_vjp
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats
 
 Part = tuple[slice, slice]

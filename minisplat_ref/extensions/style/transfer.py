@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.arguments import add_number, integer
 from minisplat_ref.errors import InputError
-from minisplat_ref.progress import progress_bar
+from minisplat_ref.interface.arguments import add_number, integer
+from minisplat_ref.interface.progress import progress_bar
 
 DESCRIPTION = """\
 Paint a trained scene in the style of an image. First the photographs get the

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
 from minisplat_ref.mechanisms.surfels.discs import DISCS
 from minisplat_ref.mechanisms.surfels.stages import rays_stage, renderer_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:

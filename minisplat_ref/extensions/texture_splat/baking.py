@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend, get_backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.texture_splat import kernels, reference
@@ -29,6 +28,7 @@ from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.projection import Surfels
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend, get_backend
 from minisplat_ref.types import Bools, Camera, Floats, Model, TileBins, view_from
 
 SHARE_MIN = 1e-3  # of a material, so that its logit is finite

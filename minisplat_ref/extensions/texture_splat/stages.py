@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.texture_splat.method import TEXTURED_SURFELS
 from minisplat_ref.extensions.texture_splat.population import with_textures
 from minisplat_ref.extensions.texture_splat.reference import REACH, TILT_MAX
@@ -22,6 +21,7 @@ from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 TEXELS = 3  # the smallest texture that has a kink inside

@@ -4,12 +4,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.arguments import add_number
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.textured.population import DEGREE
+from minisplat_ref.interface.arguments import add_number
+from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import load_ply, save_ply
-from minisplat_ref.progress import progress_bar
 
 
 def add_parser(commands: Any) -> None:

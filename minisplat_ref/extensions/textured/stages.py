@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.reference import LIMB
 from minisplat_ref.extensions.textured.response import shade
@@ -10,6 +9,7 @@ from minisplat_ref.mechanisms.payload.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Bools, Floats
 
 NEAR_LIMB = 0.06  # of 1 - q . q, whose root has large higher derivatives, which need small steps

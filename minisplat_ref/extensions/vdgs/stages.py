@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import (
     CENTER,
@@ -31,6 +30,7 @@ from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 HIDDEN, N_LEVELS, N_ROWS = 3, 1, 8  # one coarse level: between many faces, steps are so small that they round

@@ -41,15 +41,15 @@ def run(args: argparse.Namespace) -> int:
     """
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
     from minisplat_ref.extensions.vr.method import BUFFER
+    from minisplat_ref.interface.progress import with_progress
+    from minisplat_ref.interface.reporting import markdown_table
     from minisplat_ref.io import load_ply, write_image
     from minisplat_ref.io.atomic import making_folder
     from minisplat_ref.io.label import warn_of_another
     from minisplat_ref.io.names import file_names
     from minisplat_ref.io.ply import read_label
     from minisplat_ref.io.run_files import read_cameras
-    from minisplat_ref.progress import with_progress
     from minisplat_ref.rendering import Request
-    from minisplat_ref.reporting import markdown_table
     from minisplat_ref.types import Model
 
     x, y = args.gaze

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.arguments import HelpFormatter, positive
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.wave import encoding, hologram_file
 from minisplat_ref.extensions.wave.hologram_file import Hologram
 from minisplat_ref.extensions.wave.sampling import finest_pitch, propagate
+from minisplat_ref.interface.arguments import HelpFormatter, positive
 from minisplat_ref.io import write_image
 from minisplat_ref.types import Floats
 

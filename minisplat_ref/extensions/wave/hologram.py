@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref import memory
-from minisplat_ref.arguments import HelpFormatter, list_of, positive
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.wave import encoding, hologram_file, windows
@@ -19,13 +18,14 @@ from minisplat_ref.extensions.wave.kernels import sum_spectra
 from minisplat_ref.extensions.wave.placement import place, steepest_slope
 from minisplat_ref.extensions.wave.reference import Complexes
 from minisplat_ref.extensions.wave.sampling import Grid, check_sampling, field_from, grid_waves
+from minisplat_ref.interface.arguments import HelpFormatter, list_of, positive
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import write_image
 from minisplat_ref.io.frames import frame_of_means, place_camera, place_population
 from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.io.run_files import CAMERAS, model_file, read_cameras
 from minisplat_ref.io.viewpoints import Viewpoint
-from minisplat_ref.progress import with_progress
 from minisplat_ref.training.representation import WORLD_UNITS
 
 DESCRIPTION = """\

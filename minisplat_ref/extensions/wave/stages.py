@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.wave.reference import Flats, spectrum, spectrum_vjp, waves_of
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats
 
 WAVELENGTH, Z = 1.0, 0.4  # lengths are in wavelengths, so that differences find no numbers of very different sizes

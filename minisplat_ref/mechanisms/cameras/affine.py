@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.antialiasing import adjugates, compensations, compensations_vjp, determinants
 from minisplat_ref.reference.covariance import covariances, covariances_vjp
 from minisplat_ref.reference.extent import extents
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, ProjectionGradient
 
 

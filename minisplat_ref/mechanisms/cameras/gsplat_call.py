@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
-from minisplat_ref.gsplat_arguments import Batch, Options, Views, check_batch
+from minisplat_ref.gsplat.arguments import Batch, Options, Views, check_batch
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
 from minisplat_ref.mechanisms.cameras.kernels import response_for
 from minisplat_ref.mechanisms.cameras.models import model_of
@@ -33,7 +32,8 @@ from minisplat_ref.mechanisms.cameras.ray_footprints import (
 )
 from minisplat_ref.mechanisms.cameras.unscented import unscented
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
-from minisplat_ref.splatting import SplatTape, splat, splat_vjp
+from minisplat_ref.rendering.backends import Backend, get_backend
+from minisplat_ref.rendering.splatting import SplatTape, splat, splat_vjp
 from minisplat_ref.types import Camera, Floats, Ints, Optics, PrimitiveGradient, RenderOutput
 
 N_RADIAL = {"pinhole": 6, "fisheye": 4}

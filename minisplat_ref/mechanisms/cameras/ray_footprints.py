@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
@@ -28,6 +27,7 @@ from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.reference.pinhole import pose, with_principal_point
 from minisplat_ref.reference.tiling import bin_gaussians
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives, Projection, TileBins, TileGrid
 
 WHITENESS_MAX = 1e12  # of |x| / s: its square is far from the end of float32

@@ -14,5 +14,5 @@ image. There are two:
 those of pixels.
 
 The gradients of the layers are in :mod:`minisplat_ref.mechanisms.features.layers`; their forward functions are those of
-LPIPS (:mod:`minisplat_ref.lpips`).
+LPIPS (:mod:`minisplat_ref.metrics.lpips`).
 """

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import LUMA
-from minisplat_ref.lpips import convolve
 from minisplat_ref.mechanisms.features.bank import FeatureBank
 from minisplat_ref.mechanisms.features.layers import HALVING_SIDE, convolve_vjp, halve, halve_vjp
+from minisplat_ref.metrics.lpips import convolve
 from minisplat_ref.types import Floats
 
 N_ORIENTATIONS, N_SCALES = 4, 3

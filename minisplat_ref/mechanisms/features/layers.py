@@ -1,7 +1,7 @@
 """The gradients of the layers that features are made of: convolution, maximum of windows, halving.
 
-The forward functions of the first two are :func:`~minisplat_ref.lpips.convolve` and
-:func:`~minisplat_ref.lpips.max_pool`.
+The forward functions of the first two are :func:`~minisplat_ref.metrics.lpips.convolve` and
+:func:`~minisplat_ref.metrics.lpips.max_pool`.
 """
 
 import numpy as np
@@ -46,7 +46,7 @@ def convolve_vjp(shape: tuple[int, int], weight: Floats, stride: int, padding: i
 
 
 def max_pool_vjp(x: Floats, size: int, stride: int, v_y: Floats) -> Floats:
-    """Gradient of :func:`minisplat_ref.lpips.max_pool`: each window passes v_y on to its first largest pixel.
+    """Gradient of :func:`minisplat_ref.metrics.lpips.max_pool`: each window passes v_y on to its first largest pixel.
 
     Parameters
     ----------

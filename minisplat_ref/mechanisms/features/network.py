@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.npz import read_npz
-from minisplat_ref.lpips import convolve, max_pool
 from minisplat_ref.mechanisms.features.bank import FeatureBank
 from minisplat_ref.mechanisms.features.layers import convolve_vjp, max_pool_vjp
+from minisplat_ref.metrics.lpips import convolve, max_pool
 from minisplat_ref.types import Floats
 from minisplat_ref.validation import check_finite
 

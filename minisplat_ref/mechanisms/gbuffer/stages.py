@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.mechanisms.gbuffer.around import light_around
 from minisplat_ref.mechanisms.gbuffer.brdf import SIZE
 from minisplat_ref.mechanisms.gbuffer.environment import locate
@@ -21,6 +20,7 @@ from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 

@@ -12,13 +12,13 @@ gradient is given; what is hidden changes in steps.
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.jit.compile import n_threads
 from minisplat_ref.mechanisms.gbuffer.ray_kernels import CENTRE, NORMAL, U, V, measuring_kernel, tree_of
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, limits_of
 from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Floats, Primitives
 
 RAYS_AT_ONCE = 256  # in NumPy

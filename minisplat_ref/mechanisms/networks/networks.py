@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.mechanisms.networks import fourier, fourier_kernels, hash_grid, hash_kernels, mlp, mlp_kernels
+from minisplat_ref.rendering.backends import Backend
 
 
 class Networks(NamedTuple):

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.cpu.compositing.responses import KernelResponse
@@ -28,6 +27,7 @@ from minisplat_ref.rendering import (
     activate_vjp,
     choose_degree,
 )
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import (
     Camera,
     Floats,

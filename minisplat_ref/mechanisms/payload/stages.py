@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits, tile_hits
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 

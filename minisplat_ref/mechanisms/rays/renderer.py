@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.rays.pixel_rays import (
@@ -22,6 +21,7 @@ from minisplat_ref.mechanisms.rays.pixel_rays import (
     pixel_rays_vjp,
 )
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request, choose_degree
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, RenderOutput, View
 
 WANTS = frozenset({"depth", "stats"})

@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.mechanisms.rays.blending import Meeting, list_hits
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats
 

@@ -14,17 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref import validation as check
-from minisplat_ref.backends import REFERENCE, Backend, get_backend
 from minisplat_ref.constants import GSPLAT_1_5, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.gsplat_arguments import TILE_SIZE, Batch, Options, Views, split_batches
-from minisplat_ref.gsplat_compat import remove_rotation
+from minisplat_ref.gsplat.arguments import TILE_SIZE, Batch, Options, Views, split_batches
+from minisplat_ref.gsplat.call import remove_rotation
 from minisplat_ref.mechanisms.depth_maps.normals import LENGTH_MIN, central_normals, central_normals_vjp
 from minisplat_ref.mechanisms.surfels.projection import GSPLAT, SurfelGradient, Surfels, project, project_vjp
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.renderer import Shown, list_tiles
 from minisplat_ref.mechanisms.surfels.response import Layout
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
+from minisplat_ref.rendering.backends import REFERENCE, Backend, get_backend
 from minisplat_ref.types import Camera, Floats, Ints, Primitives, RenderOutput
 
 DEPTH_MODES = ("expected", "median")
@@ -101,7 +101,7 @@ def rasterization_2dgs(
     Parameters
     ----------
     means, quats, scales, opacities, colors, viewmats, Ks, width, height
-        As for :func:`minisplat_ref.gsplat_compat.rasterization`, batches included. The third scale is not read.
+        As for :func:`minisplat_ref.gsplat.call.rasterization`, batches included. The third scale is not read.
     near_plane, far_plane, radius_clip, sh_degree, backgrounds, render_mode
         As there.
     tile_size : int

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
@@ -31,6 +30,7 @@ from minisplat_ref.rendering import (
     lit_from_behind,
     parameters_vjp,
 )
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import (
     BlendGradient,
     Camera,

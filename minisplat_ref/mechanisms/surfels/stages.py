@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.mechanisms.surfels.projection import GSPLAT, SurfelGradient, Surfels, project, project_vjp
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, Shown, list_tiles
@@ -13,6 +12,7 @@ from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model, Primitives, RenderOutput, View
 

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import EXACT_ORDER, Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
@@ -22,7 +21,8 @@ from minisplat_ref.reference.compositing import composite_hits, composite_hits_v
 from minisplat_ref.reference.hits import Response
 from minisplat_ref.reference.removal import removal_changes_of_hits
 from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, lit_from_behind, parameters_vjp
-from minisplat_ref.splatting import append_depths
+from minisplat_ref.rendering.backends import REFERENCE, Backend
+from minisplat_ref.rendering.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
     Floats,

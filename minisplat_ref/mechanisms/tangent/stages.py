@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.mechanisms.tangent.renderer import RESPONSE, check_buffer_size, prepare
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
@@ -10,6 +9,7 @@ from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import Request
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Gaussians, Ints, Model
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.oracle.golden.format import Arrays, Golden
 from minisplat_ref.oracle.golden.running import grid_of, projection_of, reference_bins
 from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.oracle.tolerances import COMPARE_FLOAT64
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.backends import BACKENDS, CPU, CUDA, CUDA_ATOMIC, REFERENCE, Backend, get_backend
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, PROFILES, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
@@ -22,6 +21,7 @@ from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.planted import PLANTED, plant
 from minisplat_ref.oracle.renderer import ComparedRenderer
+from minisplat_ref.rendering.backends import BACKENDS, CPU, CUDA, CUDA_ATOMIC, REFERENCE, Backend, get_backend
 
 
 def from_backend(backend: Backend, dtype: str, conventions: Conventions | None = None) -> ComparedRenderer:

@@ -9,7 +9,6 @@ size, and judged at others (:mod:`minisplat_ref.oracle.comparison.signatures`).
 from collections.abc import Callable
 from typing import NamedTuple
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.oracle.faults.backward import (
     as_planted,
     changed_project_vjp,
@@ -39,6 +38,7 @@ from minisplat_ref.oracle.faults.forward import (
     without_highest_band,
     without_rotation,
 )
+from minisplat_ref.rendering.backends import Backend
 
 
 class Fault(NamedTuple):

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.oracle.faults.forward import RIGHT, rebuilt, with_stages
 from minisplat_ref.oracle.planted import plant
 from minisplat_ref.reference import projection as reference_projection
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import CompositeGradient, PrimitiveGradient, ProjectionGradient
 
 

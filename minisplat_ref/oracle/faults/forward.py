@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.reference import projection as reference_projection
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import (
     Camera,
     CompositeGradient,

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import Conventions
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.oracle.tolerances import (
     ADAM,
     EXACT,
@@ -24,7 +25,6 @@ from minisplat_ref.oracle.tolerances import (
     SURFACE,
     StageTolerance,
 )
-from minisplat_ref.reporting import markdown_table
 from minisplat_ref.types import Camera
 
 Arrays = dict[str, NDArray[Any]]

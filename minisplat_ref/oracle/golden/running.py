@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
+from minisplat_ref.gsplat.call import rasterization, rasterization_vjp
 from minisplat_ref.oracle.golden.format import STAGE_COTANGENTS, Arrays, Golden
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step
 from minisplat_ref.types import Floats, Primitives, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 

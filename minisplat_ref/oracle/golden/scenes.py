@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, Conventions
 from minisplat_ref.oracle.golden.format import Arrays, Golden
 from minisplat_ref.oracle.golden.running import projection_of, reference_bins, run_stages
 from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Floats, Primitives, ProjectionGradient, RenderOutput
 
 

@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, render_subject, splat_tapes
 from minisplat_ref.oracle.thresholds import Thresholds, span_of, thresholds
 from minisplat_ref.oracle.tolerances import BLOCK_FLOOR, OWN_KERNELS
-from minisplat_ref.progress import with_progress
-from minisplat_ref.splatting import SplatTape
+from minisplat_ref.rendering.backends import CPU, CPU_EXACT, REFERENCE, Backend
+from minisplat_ref.rendering.splatting import SplatTape
 from minisplat_ref.types import Bools
 
 

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_arguments import Options, Views, check_batch
-from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp, render_one
+from minisplat_ref.gsplat.arguments import Options, Views, check_batch
+from minisplat_ref.gsplat.call import rasterization, rasterization_vjp, render_one
 from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.splatting import Primitives, SplatTape
+from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.rendering.splatting import Primitives, SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
 from minisplat_ref.validation import check_gaussians, choose_conventions
 

@@ -27,10 +27,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import SH_DEGREE_MAX, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import (
     Camera,
     CompositeGradient,

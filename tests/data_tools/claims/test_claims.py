@@ -12,7 +12,7 @@ from data_tools.claims import all_claims
 from data_tools.claims import depth as depth_types
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit.claim import FIGURE, RESULT
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.io import load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe

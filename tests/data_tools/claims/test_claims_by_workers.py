@@ -10,8 +10,8 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit import Report, records
 from data_tools.claims.kit.claim import RESULT, RESUMED_OUT, SEEDS, declare
 from data_tools.claims.kit.records import HAND_OUT, JOB, handing_out, job_file, one_job, resume
-from minisplat_ref.arguments import without_workers
-from minisplat_ref.runs import cluster
+from minisplat_ref.app.runs import cluster
+from minisplat_ref.interface.arguments import without_workers
 
 JOBS = [{"arm": arm, "seed": seed} for seed in (0, 1) for arm in ("a", "b")]
 SETTINGS = {"iterations": 3}

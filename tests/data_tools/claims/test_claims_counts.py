@@ -11,9 +11,9 @@ from data_tools.claims.gdgs import counts as gdgs_counts
 from data_tools.claims.kit import counts, detail
 from data_tools.claims.kit.counts import Curve
 from data_tools.claims.kit.detail import halves_of, quality
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.interface.palette import RED
 from minisplat_ref.metrics import ViewMetrics
-from minisplat_ref.reports.palette import RED
 from minisplat_ref.training.schedule import settings_of
 from minisplat_ref.types import Model, Scene, view_from
 from scenes import make_camera, make_gaussians

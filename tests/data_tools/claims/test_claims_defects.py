@@ -7,7 +7,7 @@ import pytest
 
 from data_tools.claims import defects
 from data_tools.claims.__main__ import main as measure_claim
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 

@@ -8,9 +8,9 @@ import pytest
 from data_tools.claims import max_drop as max_drop_study
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit.claim import FIGURE, RESULT
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.simplified_run import RESULT as DECISION
 from minisplat_ref.io.images import read_image
-from minisplat_ref.runs.simplified_run import RESULT as DECISION
 
 TINY = ("--views", "12", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 
@@ -23,7 +23,7 @@ def scene_folder(tmp_path_factory):
 
 
 def test_study_chooses_and_loses_what_the_command_does(scene_folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("minisplat_ref.cli.simplify.FINE_TUNE", 4)
+    monkeypatch.setattr("minisplat_ref.app.cli.simplify.FINE_TUNE", 4)
     options = ("--recipe", "3dgs-accel", "--iterations", "60")
     study = ["max-drop", str(scene_folder), *options, "--fine-tune", "4", "--limits", "0,2", "--seeds", "3"]
     assert measure_claim([*study, "--out", str(tmp_path / "out")]) == 0

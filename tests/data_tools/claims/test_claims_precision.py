@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 from data_tools.claims import precision
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.precision import FAST, PRECISIONS, STORED, n_bytes, train_in_precision
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.types import Model

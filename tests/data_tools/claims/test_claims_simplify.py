@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from data_tools.claims import simplify
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit.claim import FIGURE, RESULT
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image

@@ -8,7 +8,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.backends import CPU
 from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, Half, weigh
 from minisplat_ref.methods.adaptive.growth import collect_while_growing, grow
 from minisplat_ref.methods.adaptive.pose import rotation_of
@@ -18,6 +17,7 @@ from minisplat_ref.methods.adaptive.sky import Behind, fit_sky, open_pixels, pho
 from minisplat_ref.methods.adaptive.switches import SWITCHES
 from minisplat_ref.metrics import ssim
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import EXPOSURES, identity_exposures
 from minisplat_ref.training.pace import Decision, Measurement, Pace
 from minisplat_ref.training.rates import present_degrees

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.backends import CPU
+from minisplat_ref.app.runs.simplification import fine_tune
 from minisplat_ref.constants import SH_C0, SH_C1
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
@@ -22,7 +22,7 @@ from minisplat_ref.methods.adaptive.degrees import (
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
 from minisplat_ref.rendering import RenderSettings, render
-from minisplat_ref.runs.simplification import fine_tune
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids

@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.backends import CPU
 from minisplat_ref.methods.adaptive.evidence import Evidence, Half, displacements, halves_of, slopes, weigh
 from minisplat_ref.methods.adaptive.pose import hold_mean_pose, rotation_of, turn_held_out
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.switches import switch_pose_on
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids

@@ -5,13 +5,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.backends import CPU
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure, log_gains
 from minisplat_ref.methods.adaptive.prune import take_all_views
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.switches import switch_exposure_on
 from minisplat_ref.rendering import render
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids

@@ -5,12 +5,12 @@ import json
 import pytest
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.cli import main
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.decisions_report import decisions_section, story
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
-from minisplat_ref.runs.decisions_report import decisions_section, story
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace

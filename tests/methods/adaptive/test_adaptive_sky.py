@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.backends import CPU
 from minisplat_ref.methods.adaptive.numbers import SKY_GAIN_MIN
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.sky import (
@@ -19,6 +18,7 @@ from minisplat_ref.methods.adaptive.sky import (
 )
 from minisplat_ref.methods.adaptive.switches import switch_sky_on
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.ops import concat
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace

@@ -18,13 +18,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, MEDIAN_TRANSMITTANCE
 from minisplat_ref.mechanisms.surfels.projection import GSPLAT, project
 from minisplat_ref.mechanisms.surfels.renderer import list_tiles
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.oracle.peers.gsplat_torch import load, ray_sums, ray_weights
 from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Primitives
 
 Tensor = Any

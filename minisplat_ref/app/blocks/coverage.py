@@ -1,0 +1,92 @@
+"""Which pixels of a photograph show a block, by the Gaussian of a coarse model that weighs most in each."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.app.blocks.grid import Block
+from minisplat_ref.app.runs.part import Plane
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.frames import return_points
+from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.types import Bools, Floats, Frame, Ints, Model, Scene, View
+
+SHARE_MIN = 0.25  # of the pixels, from which on a photograph belongs to a block: VastGaussian's
+TRAIN_VIEWS_MIN = 2  # photographs without which nothing can be trained
+
+
+class Coverage(NamedTuple):
+    """What the training views show of the blocks."""
+
+    masks: list[dict[str, Bools]]
+    """For each block, by the name of the photograph: [H, W] of what it may learn from."""
+    trained: float
+    """Part of the pixels that show the scene, of all photographs, which at least one block learns from."""
+
+
+class Coarse(NamedTuple):
+    """The coarse model, and how it is drawn."""
+
+    model: Model
+    render_settings: RenderSettings
+    frame: Frame
+
+    @property
+    def means(self) -> Floats:
+        """[N, 3] centres, in the frame of the files, float64."""
+        return return_points(self.model.gaussians.means, self.frame)
+
+
+def cover(coarse: Coarse, scene: Scene, plane: Plane, blocks: Sequence[Block]) -> Coverage:
+    """Assign photographs to blocks.
+
+    A pixel without any Gaussian belongs to all blocks that have the photograph: where the coarse model sees nothing,
+    no block may put anything.
+
+    Parameters
+    ----------
+    coarse : Coarse
+        Trained on the scene.
+    scene : Scene
+        In the coarse model's frame; the pixels of its photographs are not read.
+    plane : Plane
+    blocks : sequence of Block
+
+    Raises
+    ------
+    InputError
+        A block has fewer than two photographs.
+    """
+    coordinates = plane.coordinates(coarse.means)  # [N, 2]
+    in_region = np.stack([block.region.contains(coordinates) for block in blocks])  # [B, N]
+    masks: list[dict[str, Bools]] = [{} for _ in blocks]
+    n_trained = n_shown = 0
+    for view in scene.train_views:
+        ids = _dominant(coarse, view)  # [H, W]
+        is_shown = ids >= 0
+        is_trained = np.zeros_like(is_shown)
+        for own, inside in zip(masks, in_region, strict=True):
+            mask = shows(ids, inside)
+            if mask.mean() >= SHARE_MIN:
+                own[view.name] = mask | ~is_shown
+                is_trained |= mask
+        n_trained, n_shown = n_trained + int(is_trained.sum()), n_shown + int(is_shown.sum())
+    for block, own in zip(blocks, masks, strict=True):
+        if len(own) < TRAIN_VIEWS_MIN:
+            raise InputError(
+                f"block {block.name} has {len(own)} photographs of which {SHARE_MIN:.0%} show it, and training needs"
+                f" {TRAIN_VIEWS_MIN}: give fewer blocks, or more photographs there"
+            )
+    return Coverage(masks, n_trained / max(n_shown, 1))
+
+
+def shows(ids: Ints, inside: Floats | Bools) -> Bools:
+    """Return [H, W]: where the dominant Gaussian ``ids`` is one of ``inside`` [N]; nowhere where there is none."""
+    return np.append(inside, False)[ids]  # -1 is the last
+
+
+def _dominant(coarse: Coarse, view: View) -> Ints:
+    output, _ = coarse.render_settings.render(coarse.model, view, frozenset({"stats"}))
+    assert output.stats is not None
+    return output.stats.dominant_ids

@@ -1,0 +1,263 @@
+"""The plan of a training in blocks: what was asked for, the blocks, and their trainings; and how the folder holds it.
+
+::
+
+    DIR/plan.json            the grid; once it is planned, the blocks
+    DIR/plan.png             the plan seen from above
+    DIR/blocks/config.json   the settings that were asked for
+    DIR/blocks/coarse/       run folder of the coarse model
+    DIR/blocks/0-1.json      what block 0-1 trains on, and 0-1.npz
+    DIR/blocks/0-1/          its run folder
+    DIR/...                  an ordinary run folder, of the merged model
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.app.blocks.coverage import Coarse, cover
+from minisplat_ref.app.blocks.grid import Block, divide, ground_plane
+from minisplat_ref.app.listing_file import select
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.part import Part, Plane, Region, box_from_json
+from minisplat_ref.app.runs.scoring import renderer_of
+from minisplat_ref.app.runs.settings import Settings, load, load_model, recipe_of
+from minisplat_ref.constants import PROFILES
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.scene import Listing
+from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.rendering.backends import get_backend
+from minisplat_ref.types import Floats, Scene
+
+PLAN = "plan.json"
+COARSE = "coarse"
+COARSE_RECIPE = "3dgs-accel"  # its Gaussians are what every recipe can start from
+COARSE_PART = 4  # a quarter of the iterations of a training of the whole
+COARSE_ITERATIONS = 1000  # for recipes that decide their own length
+PIXEL_BYTES = 4  # of a photograph, three, and of its mask
+TRAINED_COPIES = 4  # parameters, gradients, two moments
+FRESH: dict[str, Any] = {"extension": None, "set": {}, "simplify": None, "scene_type": None}
+
+
+class Asked(NamedTuple):
+    """What was asked for."""
+
+    folder: Path
+    settings: Settings
+    """Of a training of the whole."""
+    shape: tuple[int, int]
+    """Slabs, and blocks of a slab."""
+
+    @property
+    def blocks_folder(self) -> Path:
+        """Where the trainings are."""
+        return self.folder / run_folder.BLOCKS
+
+    def run_folder_of(self, name: str) -> Path:
+        """Return the run folder of a block, or of the coarse model."""
+        return self.blocks_folder / name
+
+    @property
+    def coarse(self) -> Settings:
+        """Settings of the coarse training."""
+        whole = self.settings.iterations
+        n = COARSE_ITERATIONS if recipe_of(self.settings).cooling is not None else whole // COARSE_PART
+        n = max(1, min(n, whole))
+        return self.settings._replace(recipe=COARSE_RECIPE, iterations=n, schedule_iterations=n, **FRESH)
+
+
+class Planned(NamedTuple):
+    """A block in the plan."""
+
+    block: Block
+    n_photographs: int
+    iterations: int
+    """Of its training."""
+    megabytes: int
+    """Of its photographs with their masks, and of its first Gaussians while they are trained; what a process takes
+    anyway, and what Gaussians are added, comes on top."""
+
+
+class Plan(NamedTuple):
+    """All blocks."""
+
+    plane: Plane
+    blocks: tuple[Planned, ...]
+    trained: float
+    """As :attr:`~minisplat_ref.app.blocks.coverage.Coverage.trained`."""
+
+    def settings_of(self, asked: Asked, planned: Planned) -> Settings:
+        """Return the settings of the training of a block."""
+        return asked.settings._replace(
+            iterations=planned.iterations,
+            schedule_iterations=planned.iterations,
+            init=str(asked.run_folder_of(COARSE).resolve()),
+            block=str((asked.blocks_folder / f"{planned.block.name}.json").resolve()),
+        )
+
+
+def begin(asked: Asked, config: dict[str, Any]) -> None:
+    """Make the folder: ``plan.json`` without blocks, and the settings.
+
+    Parameters
+    ----------
+    asked : Asked
+    config : dict
+        Of :func:`minisplat_ref.app.runs.settings.to_config`.
+    """
+    run_folder.create(asked.blocks_folder)
+    run_folder.write_json(asked.blocks_folder / run_folder.CONFIG, config)
+    run_folder.write_json(asked.folder / PLAN, {"grid": list(asked.shape)})
+
+
+def load_asked(folder: Path) -> Asked:
+    """Read what :func:`begin` wrote.
+
+    Raises
+    ------
+    InputError
+        The folder holds no training in blocks, or one of another version.
+    """
+    shape = run_folder.read_json_object(folder / PLAN).get("grid")
+    if not (isinstance(shape, list) and len(shape) == 2 and all(type(n) is int and n > 0 for n in shape)):
+        raise InputError(f"{folder / PLAN} has no grid of two whole numbers: train again, into another folder")
+    return Asked(folder, load(folder / run_folder.BLOCKS), (shape[0], shape[1]))
+
+
+def make_plan(asked: Asked, listing: Listing, scene: Scene, coarse: Coarse, centers: Floats) -> Plan:
+    """Plan by the coarse model, and write the parts of all blocks.
+
+    Parameters
+    ----------
+    asked : Asked
+    listing : Listing
+        Of the whole.
+    scene : Scene
+        Of the coarse training, in its frame.
+    coarse : Coarse
+        Its model.
+    centers : ndarray of shape (V, 3)
+        Of the training cameras, in the frame of the files.
+
+    Raises
+    ------
+    InputError
+        The cameras cannot be divided so, or a block has too few photographs.
+    """
+    plane = ground_plane(centers)
+    blocks = divide(plane.coordinates(centers), asked.shape)
+    masks, trained = cover(coarse, scene, plane, blocks)
+    for block, own in zip(blocks, masks, strict=True):
+        part = Part(Region(plane, block.region), select(listing, own.keys()), own)
+        part.write(asked.blocks_folder / f"{block.name}.json")
+    n_views, cooling = len(scene.train_views), recipe_of(asked.settings).cooling
+    whole = asked.settings.iterations
+    gaussians = coarse.model.gaussians
+    places = plane.coordinates(coarse.means)  # [N, 2]
+    planned = []
+    for block, own in zip(blocks, masks, strict=True):
+        n_iterations = whole if cooling is not None else max(1, round(whole * len(own) / n_views))
+        n_bytes = PIXEL_BYTES * sum(mask.size for mask in own.values())
+        share = np.count_nonzero(block.region.contains(places)) / len(places)
+        n_bytes += round(share * TRAINED_COPIES * sum(field.nbytes for field in gaussians))
+        planned.append(Planned(block, len(own), n_iterations, math.ceil(n_bytes / 1e6)))
+    return Plan(plane, tuple(planned), trained)
+
+
+def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> str | None:
+    """Return a sentence if the largest blocks of so many workers of this machine do not fit beside each other."""
+    largest = sorted((planned.megabytes for planned in plan.blocks), reverse=True)[:n_workers]
+    if 1e6 * sum(largest) <= free_bytes:
+        return None
+    a, b = asked.shape
+    finer = f"{2 * a}x{b}" if a <= b else f"{a}x{2 * b}"
+    is_one = len(largest) == 1
+    which = "the largest block takes" if is_one else f"the {len(largest)} largest blocks take"
+    way_out = "begin again" if is_one else "give fewer --workers, or begin again"
+    return (
+        f"{which} {sum(largest) / 1e3:.1f} GB with photographs and first Gaussians, and {free_bytes / 1e9:.1f}"
+        f" GB are free: photographs will be read again and again; {way_out} with a finer grid, such as --blocks {finer}"
+    )
+
+
+def save_plan(asked: Asked, plan: Plan) -> None:
+    """Write ``plan.json``, after all that it speaks of is there."""
+    run_folder.write_json(asked.folder / PLAN, to_json(asked, plan))
+
+
+def load_coarse(asked: Asked, scene: Scene) -> Coarse:
+    """Read the coarse model, and how it is drawn before the scene's background."""
+    folder, settings = asked.run_folder_of(COARSE), asked.coarse
+    model = load_model(folder, settings)
+    conventions, backend = PROFILES[settings.profile], get_backend(settings.backend)
+    drawn = RenderSettings(scene.background, conventions, backend, renderer_of(settings, model))
+    return Coarse(model, drawn, scene.frame)
+
+
+def to_json(asked: Asked, plan: Plan) -> dict[str, Any]:
+    """Return the content of ``plan.json``."""
+    return {
+        "grid": list(asked.shape),
+        "origin": plan.plane.origin.tolist(),
+        "axes": plan.plane.axes.tolist(),
+        "coarse_iterations": asked.coarse.iterations,
+        "iterations": asked.coarse.iterations + sum(planned.iterations for planned in plan.blocks),
+        "trained_pixels": plan.trained,
+        "blocks": [
+            {
+                "name": planned.block.name,
+                "core": planned.block.core.to_json(),
+                "region": planned.block.region.to_json(),
+                "cameras": planned.block.n_cameras,
+                "photographs": planned.n_photographs,
+                "iterations": planned.iterations,
+                "megabytes": planned.megabytes,
+            }
+            for planned in plan.blocks
+        ],
+    }
+
+
+def load_plan(folder: Path) -> Plan | None:
+    """Read the plan; None where there is none yet.
+
+    Raises
+    ------
+    InputError
+        The file is not one of this version.
+    """
+    content = run_folder.read_json_object(folder / PLAN)
+    if "blocks" not in content:
+        return None
+    try:
+        blocks = tuple(_planned(entry) for entry in content["blocks"])
+        plane = Plane(np.array(content["origin"], float), np.array(content["axes"], float))
+        return Plan(plane, blocks, float(content["trained_pixels"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{folder / PLAN} is not a plan of this version ({error}): train again, into another folder"
+        ) from error
+
+
+def _planned(entry: dict[str, Any]) -> Planned:
+    core, region = box_from_json(entry["core"]), box_from_json(entry["region"])
+    block = Block(str(entry["name"]), core, region, int(entry["cameras"]))
+    return Planned(block, int(entry["photographs"]), int(entry["iterations"]), int(entry["megabytes"]))
+
+
+def describe(asked: Asked, plan: Plan) -> str:
+    """Return the plan in a line."""
+    numbers = [planned.n_photographs for planned in plan.blocks]
+    total = asked.coarse.iterations + sum(planned.iterations for planned in plan.blocks)
+    return (
+        f"{len(numbers)} blocks of {_range(numbers)} photographs, {total:,} iterations in all; {plan.trained:.0%} of"
+        f" the pixels are trained on; see {asked.folder / run_folder.BLOCK_PLAN}"
+    )
+
+
+def _range(numbers: Sequence[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low} to {high}"

@@ -1,0 +1,153 @@
+"""The four phases of a training in blocks, each from where it was: coarse, plan, blocks, merge.
+
+The trainings are processes, in turn or by workers; plan and merge are done here. Everything that a phase needs is on
+disk, so that a run that was killed anywhere continues, and ends with the same bytes.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from minisplat_ref.app.blocks.merge import merge, write_history
+from minisplat_ref.app.blocks.picture import draw_plan
+from minisplat_ref.app.blocks.plan import (
+    COARSE,
+    PLAN,
+    Asked,
+    Plan,
+    describe,
+    load_asked,
+    load_coarse,
+    load_plan,
+    make_plan,
+    save_plan,
+    too_large,
+)
+from minisplat_ref.app.runs.cluster import Workers, carry_out_all
+from minisplat_ref.app.runs.run_folder import BLOCK_PLAN, has_begun
+from minisplat_ref.app.runs.settings import Settings, list_photographs, load_frame, load_photographs, recipe_of
+from minisplat_ref.app.runs.trainings import HEADINGS, status_of, train_here, words_of, words_to_end
+from minisplat_ref.app.runs.worker import Job
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.frames import return_camera
+from minisplat_ref.memory import free_bytes
+from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import Scene
+
+
+def check(settings: Settings, recipe: Recipe, state: TrainState) -> None:
+    """Refuse a recipe whose model is more than Gaussians that can be put side by side.
+
+    Parameters
+    ----------
+    settings : Settings
+    recipe : Recipe
+    state : TrainState
+        Before the first iteration.
+
+    Raises
+    ------
+    InputError
+        It trains parameters that belong to no Gaussian, or reads photographs of other lenses as they are.
+    """
+    representation = recipe.representation
+    if state.shared:
+        raise InputError(
+            f"--blocks merges Gaussians, and recipe {settings.recipe} also trains {', '.join(sorted(state.shared))} of"
+            " the whole scene: take another recipe, or leave out what switches that on"
+        )
+    if representation.takes_optics and not settings.undistort:
+        raise InputError(f"--blocks needs photographs without distortion, not recipe {settings.recipe}: --undistort")
+    if representation.from_file is not None:
+        raise InputError(f"--blocks starts from a coarse model, which recipe {settings.recipe} cannot")
+
+
+def train_coarse(asked: Asked, workers: Workers) -> int:
+    """Train the coarse model to its end; return the exit code."""
+    return _train(asked, {COARSE: asked.coarse}, workers)
+
+
+def plan_blocks(asked: Asked) -> Plan:
+    """Return the plan, which is made and drawn if there is none yet.
+
+    Raises
+    ------
+    InputError
+        See :func:`.plan.make_plan`.
+    """
+    plan = load_plan(asked.folder)
+    if plan is not None:
+        return plan
+    frame = load_frame(asked.run_folder_of(COARSE))
+    listing = list_photographs(asked.coarse)
+    scene = load_photographs(asked.coarse, frame, listing)
+    coarse = load_coarse(asked, scene)
+    centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])  # [V, 3]
+    plan = make_plan(asked, listing, scene, coarse, centers)
+    draw_plan(plan, centers, coarse.means, asked.folder / BLOCK_PLAN)
+    save_plan(asked, plan)
+    print(describe(asked, plan))
+    return plan
+
+
+def train_blocks(asked: Asked, plan: Plan, workers: Workers) -> int:
+    """Train all blocks to their ends; return the exit code."""
+    warning = too_large(asked, plan, max(workers.n, 1), free_bytes())
+    if workers.address is None and warning is not None:
+        print(f"minisplat-ref: {warning}", file=sys.stderr)
+    return _train(asked, {planned.block.name: plan.settings_of(asked, planned) for planned in plan.blocks}, workers)
+
+
+def merged(asked: Asked, plan: Plan) -> tuple[Scene, Recipe, TrainState]:
+    """Return what the run of the whole ends with; what a merge leaves out is said."""
+    scene = load_photographs(asked.settings)
+    state, left_out = merge(asked, plan, scene)
+    for sentence in left_out:
+        print(f"minisplat-ref: {sentence}, which the merged model does not have")
+    write_history(asked, plan, state)
+    return scene, recipe_of(asked.settings), state
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Return whether a folder holds a training in blocks that has not been merged."""
+    return (folder / PLAN).exists() and not has_begun(folder)
+
+
+def _train(asked: Asked, trainings: dict[str, Settings], workers: Workers) -> int:
+    """Take trainings to their ends, in turn or by workers; return the exit code."""
+    jobs, folder = [], asked.folder.resolve()
+    for name, settings in trainings.items():
+        run = asked.run_folder_of(name)
+        status = status_of(run, settings)
+        print(f"{_title(name)}, {settings.iterations} iterations{HEADINGS[status]}", flush=True)
+        if status == "finished":
+            continue
+        if workers.is_used:
+            jobs.append(Job(_title(name), next_words, (folder, name), run.resolve()))
+            continue
+        words = words_to_end(run, settings, words_of(settings, run))
+        code = 0 if words is None else train_here(words)
+        if code != 0:
+            return code
+    inputs = [Path(asked.settings.scene)]
+    return carry_out_all(workers, jobs, folder, inputs, lambda job: print(f"{job.name}: ended", flush=True))
+
+
+def _title(name: str) -> str:
+    return "coarse model" if name == COARSE else f"block {name}"
+
+
+def next_words(folder: Path, name: str) -> Sequence[str] | None:
+    """Return the command that takes a training of a folder from where it is to its end; called on the worker."""
+    asked = load_asked(folder)
+    if name == COARSE:
+        settings = asked.coarse
+    else:
+        plan = load_plan(folder)
+        assert plan is not None
+        settings = next(plan.settings_of(asked, p) for p in plan.blocks if p.block.name == name)
+    run = asked.run_folder_of(name)
+    return words_to_end(run, settings, words_of(settings, run))

@@ -1,0 +1,184 @@
+"""``compare``: trains a scene by several recipes, and sets their results side by side."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import (
+    Commands,
+    HelpFormatter,
+    add_worker_arguments,
+    integer,
+    list_of,
+    name,
+    option_name,
+)
+
+if TYPE_CHECKING:
+    from minisplat_ref.app.comparison.plan import Plan
+    from minisplat_ref.types import Scene
+
+DEFAULTS: dict[str, Any] = {
+    "iterations": (3000,),
+    "seeds": (0,),
+    "downscale": 1,
+    "test_every": 8,
+    "eval_every": None,
+    "budget": None,
+    "simplify": None,
+    "scene_type": None,
+    "lpips_weights": None,
+    "init": None,
+}
+
+DESCRIPTION = """\
+Train a scene by several recipes, in turn or by workers, and set the results
+side by side. DIR will hold a run folder RECIPE-seedS for each training,
+compare.json, the figures as PNG, and report.html with all of it.
+
+The first recipe is what the others are compared with. After Ctrl-C or a crash
+--resume continues: finished trainings are kept, one that was cut off continues.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref compare photos/fox --recipes 3dgs-accel,mini-splatting2 \\
+      --iterations 3000,1800 --seeds 0,1,2 --out runs/fox-compared
+  minisplat-ref compare --resume runs/fox-compared --workers 2"""
+
+INTERRUPTED = 130  # exit code, of a training too
+
+COMPARE, REPORT = "compare.json", "report.html"
+PSNR_OVER_TIME, PSNR_OVER_ITERATIONS = "psnr_over_time.png", "psnr_over_iterations.png"
+PSNR_OVER_COUNT, CHAMFER_OVER_ITERATIONS = "psnr_over_count.png", "chamfer_over_iterations.png"
+GALLERY = "gallery.png"
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command. Options that are not given are absent, so that ``--resume`` can tell."""
+    parser = commands.add_parser(
+        "compare",
+        help="train a scene by several recipes and compare them",
+        usage="minisplat-ref compare [-h] SCENE --recipes A,B --out DIR [options]\n"
+        "       minisplat-ref compare --resume DIR",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+        argument_default=argparse.SUPPRESS,
+    )
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="folder of a scene, as for train")
+    parser.add_argument("--recipes", type=list_of(name), metavar="A,B", help="names as in train --recipe")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for the results")
+    parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the comparison in DIR")
+    parser.add_argument(
+        "--iterations",
+        type=list_of(integer(1)),
+        metavar="N",
+        help="of every training, or N,M with a number for each recipe (default 3000)",
+    )
+    parser.add_argument("--seeds", type=list_of(integer(0)), metavar="S,T", help="of the trainings (default 0)")
+    parser.add_argument(
+        "--eval-every", type=integer(1), metavar="K", help="measure test views each K-th (default 24 times in all)"
+    )
+    parser.add_argument(
+        "--budget", type=integer(1), metavar="N", help="as for train, for the recipes that simplify to one"
+    )
+    parser.add_argument(
+        "--simplify", choices=("sampling", "rank", "merging"), metavar="S", help="likewise: sampling, rank or merging"
+    )
+    parser.add_argument("--scene-type", choices=("indoor", "outdoor"), metavar="T", help="likewise: indoor or outdoor")
+    parser.add_argument(
+        "--downscale", type=integer(1), metavar="D", help="make the photographs D times smaller (default 1)"
+    )
+    parser.add_argument(
+        "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing (default 8)"
+    )
+    parser.add_argument("--init", type=Path, metavar="START", help="as for train: points or run to start from")
+    parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
+    add_worker_arguments(parser)
+    parser.set_defaults(run=run, needs=("matplotlib",))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, measure, write the files, print the table."""
+    from minisplat_ref.app.comparison.plan import check, remove_if_unused, save_plan
+    from minisplat_ref.app.comparison.runs import statuses, train_all, train_by_workers, warm_up
+    from minisplat_ref.app.runs import run_folder
+    from minisplat_ref.app.runs.cluster import Workers
+    from minisplat_ref.training.interruption import terminated_like_interrupted
+
+    given, workers = vars(args), Workers(args.workers, args.cluster)
+    plan = _resume(given) if "resume" in given else _new(given)
+    scene = check(plan)
+    stages = statuses(plan)
+    if any(stage != "finished" for stage in stages):
+        warm_up(plan, scene)
+    run_folder.create(plan.folder)
+    save_plan(plan)
+    try:
+        with terminated_like_interrupted():
+            code = train_by_workers(plan, stages, workers) if workers.is_used else train_all(plan, stages)
+            if code == 0:
+                _report(plan, scene)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except InputError:
+        remove_if_unused(plan.folder)
+        raise
+    if code == INTERRUPTED:
+        print(f"minisplat-ref: interrupted; to continue: minisplat-ref compare --resume {plan.folder}", file=sys.stderr)
+    elif code != 0:
+        remove_if_unused(plan.folder)
+    return code
+
+
+def _new(given: dict[str, Any]) -> "Plan":
+    from minisplat_ref.app.comparison.plan import Plan, check_free
+
+    for needed, example in (("scene", "a SCENE to train on"), ("recipes", "--recipes A,B"), ("out", "--out DIR")):
+        if needed not in given:
+            raise InputError(f"give {example}, or --resume DIR to continue a comparison")
+    check_free(given["out"])
+    options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
+    n_lengths = len(options["iterations"])
+    options["iterations"] *= len(given["recipes"]) if n_lengths == 1 else 1  # a single number is for all
+    return Plan(scene=Path(given["scene"]), folder=given["out"], recipes=given["recipes"], **options)
+
+
+def _resume(given: dict[str, Any]) -> "Plan":
+    from minisplat_ref.app.comparison.plan import load_plan
+
+    surplus = [option_name(name) for name in ("scene", "recipes", "out", *DEFAULTS) if name in given]
+    if surplus:
+        raise InputError(f"--resume takes the comparison's own settings: leave out {', '.join(surplus)}")
+    return load_plan(given["resume"])
+
+
+def _report(plan: "Plan", scene: "Scene") -> None:
+    """Write the figures, the page and compare.json, and print the tables."""
+    from minisplat_ref.app.comparison import figures
+    from minisplat_ref.app.comparison.report import fired_title, notes, report_html
+    from minisplat_ref.app.comparison.results import collect, to_json
+    from minisplat_ref.app.comparison.table import table_cells
+    from minisplat_ref.app.reports.plots import save_png
+    from minisplat_ref.app.runs import run_folder
+    from minisplat_ref.app.runs.fired import HEADING, remarks, rows
+    from minisplat_ref.interface.reporting import markdown_table
+
+    results = collect(plan, scene)
+    save_png(figures.psnr_over_time(results.curves), plan.folder / PSNR_OVER_TIME)
+    save_png(figures.psnr_over_iterations(results.curves), plan.folder / PSNR_OVER_ITERATIONS)
+    save_png(figures.psnr_over_count(results.curves), plan.folder / PSNR_OVER_COUNT)
+    if figures.is_chamfer_known(results.curves):
+        save_png(figures.chamfer_over_iterations(results.curves), plan.folder / CHAMFER_OVER_ITERATIONS)
+    save_png(figures.gallery(results.crops, plan.recipes), plan.folder / GALLERY)
+    (plan.folder / REPORT).write_text(report_html(plan, scene, results), encoding="utf-8")
+    run_folder.write_json(plan.folder / COMPARE, to_json(plan, scene, results))
+    heading, *cells = table_cells(results.recipes)
+    print(f"\n{scene.name}; {results.machine}\n\n{markdown_table(heading, cells)}\n")
+    print("\n".join(notes(plan, results)))
+    for fired in results.fired:
+        print(f"\n{fired_title(fired)}\n\n{markdown_table(HEADING, rows(fired))}")
+        print("\n".join(remarks(fired)))
+    print(f"\nopen {(plan.folder / REPORT).resolve()}")

@@ -1,0 +1,155 @@
+"""``convert``: a model from any file into a PLY, a compact format or a page to send."""
+
+import argparse
+import math
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer
+
+if TYPE_CHECKING:
+    from minisplat_ref.app.runs.conversion import Choice, Source
+    from minisplat_ref.io.formats import Format
+
+DESCRIPTION = """\
+Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
+compact file. The suffix of OUT says what is written: .ply is the 3DGS layout
+with every float; compact formats and their levels of precision, of which 0 is
+the finest, come with extensions (see minisplat-ref extensions compression);
+.html is one page to send, which shows the scene in a browser, without network.
+
+  --max-bytes B   the finest level whose file has at most B bytes
+  --max-drop dB   the coarsest level that loses at most so much PSNR, measured
+                  on at most 24 training views of the run, or of --scene
+"""
+EPILOG = """\
+If a run has not ended, its newest whole checkpoint is converted.
+
+examples:
+  minisplat-ref convert runs/fox fox.ply
+  minisplat-ref convert runs/fox fox.msz --max-drop 0.1
+  minisplat-ref convert fox.msz fox.spz
+  minisplat-ref convert runs/fox fox.html
+"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "convert",
+        help="write a model as a PLY, compact file or web page",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="MODEL", help="run folder, checkpoint, PLY or compact file")
+    parser.add_argument("output", type=Path, metavar="OUT", help="file to make or replace")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--max-bytes", type=integer(1), metavar="B", help="size that the file may have")
+    how.add_argument("--max-drop", type=_drop, metavar="dB", help="PSNR that the file may lose")
+    how.add_argument("--level", type=integer(0), metavar="N", help="precision (default: the format's own)")
+    parser.add_argument("--scene", type=Path, metavar="PATH", help="photographs for --max-drop (default: the run's)")
+    parser.add_argument(
+        "--downscale", type=integer(1), metavar="D", help="how much smaller they are made (default: the run's, or 1)"
+    )
+    parser.add_argument(
+        "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the file, and say what is in it."""
+    from minisplat_ref.app.runs.conversion import check_population, choose_format, encode_as, open_source
+    from minisplat_ref.io.formats import write_file
+
+    out: Path = args.output
+    if out.suffix.lower() == ".html":
+        return _write_page(args)
+    format_ = choose_format(out)
+    if args.max_drop is None and (args.scene is not None or args.downscale is not None):
+        raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
+    source = open_source(args.input, args.extension)
+    if format_ is None:
+        options = ("max_bytes", "max_drop", "level")
+        if given := [name for name in options if getattr(args, name) is not None]:
+            raise InputError(
+                f"a PLY has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out, or choose a"
+                " compact format"
+            )
+        source.owner.save(out, source.model.gaussians, source.label)
+        lines = ["  SuperSplat opens it, splat-transform converts it, and a page to send is convert MODEL NAME.html"]
+    else:
+        check_population(source.model.gaussians, format_, source.what)
+        format_ = format_._replace(encode=partial(encode_as, format_, out, source.label))
+        choice, measured = _choose(args, source, format_)
+        write_file(out, format_, choice.content, source.label)
+        rows = [*format_.describe(choice.content, out), *measured]
+        lines = [f"  {name}: {value}" for name, value in rows]
+    size = f"{out.stat().st_size:,} bytes"
+    print(f"{len(source.model.gaussians.means):,} Gaussians of {source.what} in {out}, {size}", *lines, sep="\n")
+    own = source.owner.representation.rates.of if source.owner.saves_plain else {}  # its files need none of these
+    if names := ", ".join(name for name in source.model.shared if name not in own):
+        print(f"minisplat-ref: a {out.suffix} does not hold {names}, which belong to no row", file=sys.stderr)
+    return 0
+
+
+def _write_page(args: argparse.Namespace) -> int:
+    """Write the model as a page that shows it, and say how to open it."""
+    from minisplat_ref.app.runs.source import open_source
+    from minisplat_ref.app.viewer.page import write_page
+    from minisplat_ref.io.formats import write_content
+    from minisplat_ref.rendering import SPLATTING
+    from minisplat_ref.types import Gaussians
+
+    out, path = args.output, args.input
+    options = ("max_bytes", "max_drop", "level", "scene", "downscale")
+    if given := [name for name in options if getattr(args, name) is not None]:
+        raise InputError(f"a page has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out")
+    source = open_source(path, args.extension)
+    trained = source.trained
+    population = trained.model.gaussians
+    if further := [name for name in population._fields if name not in Gaussians._fields]:
+        raise InputError(
+            f"{path} has {', '.join(further)}, which a page does not show: look at it with minisplat-ref view {path}"
+        )
+    name = path.resolve().name
+    cameras = [view for view in source.cameras if view.split != "test"] or source.cameras
+    write_content(out, write_page(name, population, cameras, trained.background).encode())
+    print(
+        f"{len(population.means):,} Gaussians of {name} in {out}, {out.stat().st_size:,} bytes: open it in any browser"
+    )
+    parts = [*trained.model.shared, *([] if trained.renderer.name == SPLATTING.name else [trained.renderer.name])]
+    if parts:
+        print(f"minisplat-ref: the page shows plain 3DGS, without {', '.join(parts)}", file=sys.stderr)
+    return 0
+
+
+def _choose(args: argparse.Namespace, source: "Source", format_: "Format") -> "tuple[Choice, list[tuple[str, str]]]":
+    """Return the level that the command line asks for, and what was measured for it."""
+    from minisplat_ref.app.runs import conversion
+
+    gaussians = source.model.gaussians
+    if args.max_bytes is not None:
+        return conversion.finest_within(gaussians, format_, args.max_bytes), []
+    if args.max_drop is not None:
+        judge = conversion.judge_of(source, args.input, args.scene, args.downscale)
+        choice = conversion.coarsest_within(gaussians, format_, args.max_drop, judge.psnr_of)
+        return choice, [("PSNR", f"{choice.drop:.3f} dB lost on {judge.views}")]
+    level = format_.default_level if args.level is None else args.level
+    if level >= len(format_.levels):
+        raise InputError(f"--level {level} is too high: {format_.suffix} has levels 0 to {len(format_.levels) - 1}")
+    return conversion.Choice(level, format_.encode(gaussians, level)), []
+
+
+def _drop(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of dB of at least 0")
+    return value

@@ -1,0 +1,111 @@
+"""``demo``: makes a scene, trains it, and shows the result in a page and a report."""
+
+import argparse
+import itertools
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+from minisplat_ref.app.cli.steps import do
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.interface.progress import with_progress
+
+SCENE = {"n_views": 28, "width": 192, "height": 144, "n_points": 8000, "seed": 0, "test_every": 8}
+RECIPE = "3dgs-accel"
+SCHEDULE_ITERATIONS = 30_000  # the published pace: compressed to so few iterations it would only split and clone
+ITERATIONS = 750  # fit into two minutes with compilation, and densify twice
+DEFAULT_OUT = "minisplat-demo"
+
+DESCRIPTION = f"""\
+See the program work, with nothing to download: ray-trace photographs of a
+small room, train Gaussians on them (the first {ITERATIONS} iterations of recipe
+{RECIPE}), and measure views that the training never saw. It writes
+scene.html, which shows the room in any browser, and report.html: images, depth
+against the exact depth, curves, and what to try next.
+
+Takes a minute or two on two cores. The folder that it leaves is a run like
+those of train, with the photographs in DIR/scene.
+"""
+EPILOG = """\
+example:
+  minisplat-ref demo --out demo"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "demo",
+        help="see it work: make a scene, train it, write a report",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help=f"new folder for all of it (default {DEFAULT_OUT})")
+    parser.add_argument(
+        "--iterations", type=integer(1), default=ITERATIONS, metavar="N", help=f"of the training (default {ITERATIONS})"
+    )
+    parser.set_defaults(run=run, needs=("matplotlib",))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the scene, train, write the report, and say where it is."""
+    from minisplat_ref.app.runs import run_folder
+    from minisplat_ref.app.runs.demo_report import report_html, view_images
+    from minisplat_ref.app.runs.first_use import compile_kernels
+    from minisplat_ref.app.runs.next_steps import PAGE, live_view
+    from minisplat_ref.app.runs.run import run_training
+    from minisplat_ref.app.runs.scoring import summary
+    from minisplat_ref.app.runs.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.constants import GSPLAT_MAIN
+    from minisplat_ref.datasets.synthetic import make_scene
+    from minisplat_ref.datasets.synthetic.files import write_scene
+    from minisplat_ref.training.initial_state import initial_state
+    from minisplat_ref.training.interruption import terminated_like_interrupted
+
+    start = time.perf_counter()
+    folder = args.out or _first_free(Path(DEFAULT_OUT))
+    run_folder.check_free(folder)
+    synthetic = make_scene("room", **SCENE, progress=partial(with_progress, description="ray-tracing", unit="views"))
+    write_scene(synthetic, folder / "scene", {"scene": "room", **SCENE})
+    settings = Settings(
+        scene=str((folder / "scene").resolve()),
+        downscale=1,
+        test_every=SCENE["test_every"],
+        undistort=False,
+        recipe=RECIPE,
+        schedule_iterations=SCHEDULE_ITERATIONS,
+        iterations=args.iterations,
+        seed=0,
+        profile=GSPLAT_MAIN.name,
+        backend="cpu",
+    )
+    scene = load_photographs(settings)
+    recipe = recipe_of(settings)
+    state = initial_state(scene, recipe, settings.seed)
+    compile_kernels(settings.backend)
+    with terminated_like_interrupted(), run_folder.hold_folder(folder):
+        outcome = run_training(folder, scene, settings, recipe, state)
+    if outcome.evaluation is None:
+        print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
+        return 130
+    images = view_images(folder, synthetic, scene, outcome.evaluation)
+    page = report_html(folder, scene, settings, outcome, images, time.perf_counter() - start)
+    (folder / run_folder.REPORT).write_text(page, encoding="utf-8")
+    if not outcome.is_complete:
+        report = folder / run_folder.REPORT
+        print(f"minisplat-ref: stopped after {state.step} iterations, report of these: {report}", file=sys.stderr)
+        return 130
+    print(f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians")
+    do("convert", folder, folder / PAGE)
+    live = live_view(folder)
+    print(f"the room, in any browser: open {(folder / PAGE).resolve()}")
+    print(f"how good it is, and what to try next: open {(folder / run_folder.REPORT).resolve()}")
+    print(f"{live.purpose.lower()}: {live.line}")
+    return 0
+
+
+def _first_free(folder: Path) -> Path:
+    """Return the folder, or with the first number behind it that no earlier demo has taken."""
+    names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{n}") for n in itertools.count(2)))
+    return next(name for name in names if not name.exists())

@@ -1,0 +1,104 @@
+"""``photos``: from a folder of photographs to a page that shows the scene, a film and a report, in one command."""
+
+import argparse
+from pathlib import Path
+
+from minisplat_ref.app.cli.sfm import MATCHINGS
+from minisplat_ref.app.cli.steps import do
+from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer, positive
+
+SCENE, RUN, PAGE, FILM = "scene", "run", "scene.html", "film.gif"
+
+DESCRIPTION = """\
+Make a 3D model of what photographs show: find their cameras, choose a size that
+a laptop trains in minutes, train, and write a page that shows the scene in any
+browser, and a film along the photographer's path. It prints the command of each
+step, which can be given alone to choose more. DIR will hold:
+
+  scene/       the photographs with their cameras, a COLMAP scene (sfm)
+  run/         report.html, point_cloud.ply, metrics.json and more (train)
+  scene.html   the scene, to look at offline and to send (convert)
+  film.gif     (render)
+
+Some 20 to 60 photographs of something that stands still, taken from places a
+step apart, with a lot of overlap, are a good start. After an interruption the
+same command continues.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref photos holiday/fountain
+  minisplat-ref photos holiday/fountain --minutes 10 --out fountain"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "photos",
+        help="your photographs: cameras, training, page, film and report",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs, or a video")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for all of it (default splats/PHOTOS)")
+    parser.add_argument("--minutes", type=positive, metavar="T", help="the most minutes to train (default: as needed)")
+    parser.add_argument(
+        "--downscale",
+        type=integer(1),
+        metavar="K",
+        help="train at 1/K of the scene's width and height (default: of at most 640 pixels)",
+    )
+    parser.add_argument(
+        "--matching",
+        choices=MATCHINGS,
+        metavar="M",
+        help="exhaustive (default), or sequential (default of a video)",
+    )
+    parser.set_defaults(run=run, needs=("matplotlib",))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the steps that have not been done, and say where their results are."""
+    from minisplat_ref.app.reports.commands import command
+    from minisplat_ref.app.runs import run_folder, settings
+    from minisplat_ref.app.runs.next_steps import live_view
+    from minisplat_ref.datasets.video import is_video
+
+    path = args.photos.resolve()
+    folder = args.out or Path("splats") / (path.stem if is_video(path) else path.name)
+    scene, trained, page, film = (folder / name for name in (SCENE, RUN, PAGE, FILM))
+    if not args.photos.is_dir() and not is_video(args.photos):
+        raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")
+    if not scene.exists():
+        matching = () if args.matching is None else ("--matching", args.matching)
+        do("sfm", args.photos, "--out", scene, *matching)
+    if not run_folder.has_begun(trained):
+        factor = _choose_factor(scene) if args.downscale is None else args.downscale
+        limit = () if args.minutes is None else ("--minutes", f"{args.minutes:g}")
+        code = do("train", scene, "--downscale", str(factor), *limit, "--out", trained)
+    elif not run_folder.is_finished(trained, settings.load(trained).iterations):
+        code = do("train", "--resume", trained)
+    else:
+        code = 0
+    if code != 0:
+        return code
+    if not page.exists():
+        do("convert", trained, page)
+    if not film.exists():
+        do("render", trained, "--cameras", "orbit", "--film", film)
+    live = live_view(trained)
+    print(f"the scene, in any browser: open {page.resolve()}")
+    print(f"how good it is, and what to try next: open {(trained / run_folder.REPORT).resolve()}")
+    print(f"{live.purpose.lower()}: {live.line}")
+    print(f"make it smaller: {command('simplify', trained, '--out', folder / 'small')}")
+    return 0
+
+
+def _choose_factor(scene: Path) -> int:
+    """Return the factor by which photographs are made smaller for the training."""
+    from minisplat_ref.app.runs.proposed_size import comfortable_factor
+    from minisplat_ref.io.images import image_size
+
+    sizes = [image_size(file) for file in sorted((scene / "images").rglob("*")) if file.is_file()]
+    return comfortable_factor(*max(sizes, key=max))

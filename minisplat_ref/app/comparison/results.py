@@ -1,0 +1,145 @@
+"""What a comparison has found, from its finished runs, and how compare.json holds it."""
+
+import platform
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from minisplat_ref.app.comparison.crops import Crop, choose_crops
+from minisplat_ref.app.comparison.metrics import (
+    METRICS,
+    RecipeMetrics,
+    final_psnr,
+    read_curve,
+    read_metrics,
+    relation,
+)
+from minisplat_ref.app.comparison.plan import Plan
+from minisplat_ref.app.comparison.speed import render_rates
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
+from minisplat_ref.app.runs.fired import Fired
+from minisplat_ref.app.runs.scoring import load_trained
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.interface.reporting import describe_machine
+from minisplat_ref.types import Scene
+
+
+class Results(NamedTuple):
+    """All that was found."""
+
+    recipes: Sequence[RecipeMetrics]
+    """Measures, in the order of the plan."""
+    curves: dict[str, list[list[dict[str, Any]]]]
+    """For every recipe the records of ``curve.jsonl`` of each seed."""
+    fired: Sequence[Fired]
+    """Which mechanisms acted, in the order of the plan."""
+    crops: Sequence[Crop]
+    """Parts of test views, rendered with the first seed of each recipe."""
+    lpips_reason: str | None
+    """Why LPIPS is missing."""
+    lpips_network: str | None
+    """By which network LPIPS was measured."""
+    machine: str
+    """What times and memory depend on."""
+
+
+def collect(plan: Plan, scene: Scene) -> Results:
+    """Read and measure the runs of a plan that has been carried out.
+
+    Parameters
+    ----------
+    plan : Plan
+        All its runs are finished.
+    scene : Scene
+        As it was loaded for the plan.
+    """
+    runs = plan.runs
+    models = [load_trained(run.folder) for run in runs]
+    rates = dict(zip((run.folder for run in runs), render_rates(models, scene), strict=True))
+    targets = {run.seed: final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
+    recipes = [
+        RecipeMetrics(
+            recipe, [read_metrics(run.folder, targets[run.seed], rates[run.folder]) for run in plan.runs_of(recipe)]
+        )
+        for recipe in plan.recipes
+    ]
+    shown = [model for run, model in zip(runs, models, strict=True) if run.seed == plan.seeds[0]]
+    metrics = run_folder.read_json_object(runs[0].folder / run_folder.METRICS)
+    return Results(
+        recipes=recipes,
+        curves={recipe: [read_curve(run.folder) for run in plan.runs_of(recipe)] for recipe in plan.recipes},
+        fired=read_fired(plan),
+        crops=choose_crops(shown, scene),
+        lpips_reason=metrics["lpips_reason"],
+        lpips_network=metrics["lpips_network"],
+        machine=f"{describe_machine()}, {platform.platform()}",
+    )
+
+
+def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
+    """Return what compare.json holds."""
+    camera = scene.test_views[0].camera
+    return {
+        "settings": {
+            **plan._asdict(),
+            "scene": str(plan.scene.resolve()),
+            "folder": str(plan.folder.resolve()),
+            **plan.files,
+            "eval_every": [plan.runs_of(recipe)[0].eval_every for recipe in plan.recipes],
+        },
+        "scene": {
+            "name": scene.name,
+            "n_train_views": len(scene.train_views),
+            "n_test_views": len(scene.test_views),
+            "width": camera.width,
+            "height": camera.height,
+            "n_points": len(scene.points),
+        },
+        "machine": results.machine,
+        "lpips_reason": results.lpips_reason,
+        "lpips_network": results.lpips_network,
+        "measures": [metric._asdict() for metric in METRICS],
+        "recipes": [
+            _recipe_to_json(plan, recipe, results.recipes[0], fired)
+            for recipe, fired in zip(results.recipes, results.fired, strict=True)
+        ],
+    }
+
+
+def read_fired(plan: Plan) -> list[Fired]:
+    """Return what fired in the finished runs of a plan, recipe by recipe."""
+    found = []
+    for name, iterations in zip(plan.recipes, plan.iterations, strict=True):
+        recipe = find_recipe(name)
+        published = count_published_times(recipe)
+        runs = [read_mechanisms(run.folder / run_folder.EVENTS, published) for run in plan.runs_of(name)]
+        found.append(Fired(name, iterations, recipe.iterations, published, runs))
+    return found
+
+
+def _recipe_to_json(plan: Plan, recipe: RecipeMetrics, first: RecipeMetrics, fired: Fired) -> dict[str, Any]:
+    spreads = {metric: recipe.spread_of(metric) for metric in METRICS}
+    runs = zip(plan.runs_of(recipe.recipe), recipe.runs, fired.runs, strict=True)
+    return {
+        "recipe": recipe.recipe,
+        "mean": {metric.key: value.mean for metric, value in spreads.items()},
+        "std": {metric.key: value.std for metric, value in spreads.items()},
+        "relative_to_first": {
+            metric.key: relation(metric, value, first.spread_of(metric)) for metric, value in spreads.items()
+        },
+        "error_of_difference": {
+            metric.key: recipe.error_of_difference(metric, first)
+            for metric in METRICS
+            if metric.relation == "difference"
+        },
+        "never_fired": fired.never,
+        "runs": [
+            {
+                "seed": run.seed,
+                "folder": run.folder.name,
+                **metrics,
+                "mechanisms": [mechanism._asdict() for mechanism in mechanisms],
+            }
+            for run, metrics, mechanisms in runs
+        ],
+    }

@@ -1,0 +1,279 @@
+"""Models from any file, and the choice of a precision: the finest that fits, or the coarsest that is good enough.
+
+What is lost by a compact file is measured on photographs that were *trained* on, at most 24 of them: the choice of a
+level is a decision like others, and the test views stay out of it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.app.runs.model_file import label_for, read_model
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, owner_of
+from minisplat_ref.io.formats import Format, with_label
+from minisplat_ref.io.frames import frame_of_means, place_scene
+from minisplat_ref.io.label import NO_LABEL, Label
+from minisplat_ref.io.ply import are_far
+from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.training.compensation import with_compensation
+from minisplat_ref.training.sky import with_sky
+from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, number_views
+
+VIEWS_MAX = 24
+NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
+
+
+class Source(NamedTuple):
+    """A model, and where it comes from."""
+
+    model: Model
+    """In the frame of its scene's files."""
+    owner: Extension
+    """Whose population it is."""
+    what: str
+    """In a few words."""
+    frame: Frame = FILE_FRAME
+    """The frame in which it is rendered."""
+    label: Label = NO_LABEL
+    """What a file of its population is to say about how it is drawn."""
+
+
+class Choice(NamedTuple):
+    """A file at one level, ready to be written."""
+
+    level: int
+    content: bytes
+    drop: float | None = None
+    """dB of PSNR that are lost; None where it was not measured."""
+
+
+def open_source(path: Path, extension: str | None = None) -> Source:
+    """Read a model from a run folder, a checkpoint, a PLY or a compact file.
+
+    Parameters
+    ----------
+    path : Path
+    extension : str, optional
+        That draws a file, in place of what it says; runs and checkpoints know theirs.
+
+    Raises
+    ------
+    InputError
+        It is none of these, or damaged, or ``extension`` is given where it is known.
+    """
+    is_checkpoint = path.suffix == ".npz"
+    if path.is_dir() or is_checkpoint:
+        if extension is not None:
+            raise InputError(f"{path} has its extension recorded: leave out --extension {extension}")
+        return _of_checkpoint(path) if is_checkpoint else _of_run(path)
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give a run folder, a checkpoint, a PLY or a compact file")
+    read = read_model(path, extension)
+    return Source(Model(read.population), read.owner, path.name, frame_of_means(read.population.means), read.label)
+
+
+def _of_run(folder: Path) -> Source:
+    from minisplat_ref.app.runs.checkpoints import newest_model
+    from minisplat_ref.app.runs.settings import load, load_frame, return_model
+
+    settings = load(folder)
+    saved = newest_model(folder, settings)
+    what = "the run's result" if saved.unfinished is None else f"iteration {saved.unfinished}"
+    owner, frame = owner_of(settings.recipe, settings.extension) or CORE, load_frame(folder)
+    label = label_for(owner, saved.model.shared, settings.set)
+    return Source(return_model(saved.model, owner, frame), owner, what, frame, label)
+
+
+def _of_checkpoint(path: Path) -> Source:
+    """Read a checkpoint without its run: the population is that of its recipe, which an extension may own."""
+    from minisplat_ref.app.runs.settings import return_model
+    from minisplat_ref.io.checkpoint import load_checkpoint
+    from minisplat_ref.training.saved_state import read_bundles, read_counters, read_frame, written_by
+
+    arrays, metadata = load_checkpoint(path)
+    step = read_counters(path, metadata).step
+    fields = {name.removeprefix("gaussians.") for name in arrays if name.startswith("gaussians.")}
+    owner = CORE if fields == set(Gaussians._fields) else owner_of(written_by(metadata)[0]) or CORE
+    bundles = read_bundles(path, arrays, owner.representation.population)
+    model, frame = Model(bundles.gaussians, bundles.shared), read_frame(path, metadata)
+    label = label_for(owner, model.shared, {})
+    return Source(return_model(model, owner, frame), owner, f"iteration {step}", frame, label)
+
+
+def choose_format(path: Path) -> Format | None:
+    """Return the format that a file to be written has by its name; None for a PLY.
+
+    Raises
+    ------
+    InputError
+        There is no such format.
+    """
+    format_ = find_format(path)
+    if format_ is None and path.suffix != ".ply":
+        suffixes = " or ".join([".ply", *(known.suffix for _, known in all_formats() if known.levels)])
+        raise InputError(f"{path} is not named like a PLY or another format: give a name that ends in {suffixes}")
+    if format_ is not None and not format_.levels:
+        raise InputError(f"{path}: a {format_.suffix} is read, but not written: choose another format")
+    return format_
+
+
+def check_population(population: Any, format_: Format, what: str) -> None:
+    """Refuse a population that has further fields than a compact format holds.
+
+    Raises
+    ------
+    InputError
+        It has.
+    """
+    further = [name for name in population._fields if name not in Gaussians._fields]
+    if further:
+        raise InputError(
+            f"{what} has {', '.join(further)}, which {format_.suffix} does not hold: convert it to a PLY, which does"
+        )
+
+
+def encode_as(format_: Format, path: Path, label: Label, gaussians: Gaussians, level: int) -> bytes:
+    """Return the content of a file at one level, with its label if it has a place for it; an error names the file.
+
+    Raises
+    ------
+    InputError
+        A value does not fit the format.
+    """
+    if are_far(gaussians):
+        distance = float(np.abs(np.median(gaussians.means, axis=0)).max())
+        raise InputError(
+            f"{path} cannot be written: its centres are some {distance:.6g} from the origin, where float32 has steps of"
+            f" {np.spacing(np.float32(distance)):.2g}; write a PLY, which holds them in float64"
+        )
+    try:
+        return with_label(format_, format_.encode(gaussians, level), label)
+    except InputError as error:
+        raise InputError(f"{path} cannot be written: {error}") from None
+
+
+def finest_within(gaussians: Gaussians, format_: Format, max_bytes: int) -> Choice:
+    """Return the finest level whose file has at most this many bytes.
+
+    Raises
+    ------
+    InputError
+        None has.
+    """
+    size = 0
+    for level in range(len(format_.levels)):
+        content = format_.encode(gaussians, level)
+        if len(content) <= max_bytes:
+            return Choice(level, content)
+        size = len(content)
+    raise InputError(
+        f"no level of {format_.suffix} fits {max_bytes:,} bytes, the coarsest takes {size:,}: allow more, or simplify"
+        " the model first"
+    )
+
+
+def coarsest_within(
+    gaussians: Gaussians, format_: Format, max_drop: float, psnr_of: Callable[[Gaussians], float]
+) -> Choice:
+    """Return the coarsest level that loses at most this many dB.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    format_ : Format
+        Levels are tried from the coarsest on, and the first that is good enough is taken.
+    max_drop : float
+        dB.
+    psnr_of : callable
+        The PSNR, dB, of Gaussians on the views that count.
+
+    Raises
+    ------
+    InputError
+        None is good enough.
+    """
+    before = psnr_of(gaussians)
+    drop = 0.0
+    for level in reversed(range(len(format_.levels))):
+        content = format_.encode(gaussians, level)
+        drop = before - psnr_of(format_.decode(content, format_.suffix))
+        if drop <= max_drop + NO_DROP:
+            return Choice(level, content, drop)
+    raise InputError(
+        f"every level of {format_.suffix} loses more than {max_drop:g} dB, the finest {drop:.3f}: allow more, or choose"
+        " another format"
+    )
+
+
+class Judge(NamedTuple):
+    """Measures Gaussians on photographs."""
+
+    psnr_of: Callable[[Gaussians], float]
+    views: str
+    """Which, in a few words."""
+
+
+def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | None) -> Judge:
+    """Return what measures a model on training views: of its run, or of a scene.
+
+    Parameters
+    ----------
+    source : Source
+        Its shared parameters and its renderer are used, too; exposures and poses with the run's own photographs only.
+    path : Path
+        Where it comes from; if that is a run, its settings and photographs are taken.
+    scene : Path, optional
+        Where the photographs are; those of the run by default.
+    downscale : int, optional
+        Factor by which they are made smaller; that of the run, or 1, by default.
+
+    Raises
+    ------
+    InputError
+        There is neither a run nor a scene, or the photographs cannot be read.
+    """
+    from minisplat_ref.app.runs.scoring import renderer_of
+    from minisplat_ref.app.runs.settings import load, load_photographs, place_model
+    from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+    from minisplat_ref.io import load_scene
+    from minisplat_ref.metrics import evaluate
+    from minisplat_ref.rendering.backends import get_backend
+
+    profile, backend = GSPLAT_MAIN.name, "cpu"
+    renderer = with_sky(with_compensation(source.owner.representation.renderer))
+    if path.is_dir():
+        settings = load(path)
+        photographs = load_photographs(
+            settings._replace(
+                scene=settings.scene if scene is None else str(scene),
+                downscale=settings.downscale if downscale is None else downscale,
+            ),
+            source.frame,
+        )
+        profile, backend = settings.profile, settings.backend
+        if scene is None:  # its own photographs, for which it may have exposures and poses
+            renderer = renderer_of(settings, source.model)
+            photographs = photographs._replace(train_views=number_views(photographs.train_views))
+    elif scene is not None:
+        photographs = place_scene(load_scene(scene, downscale=downscale or 1, undistort=True), source.frame)
+    else:
+        raise InputError(f"--max-drop needs photographs to measure on, and {path} is no run: give --scene PATH")
+    n = len(photographs.train_views)
+    rows = np.unique(np.linspace(0, n - 1, min(n, VIEWS_MAX)).round().astype(int))
+    views = [photographs.train_views[row] for row in rows]
+
+    def psnr_of(gaussians: Gaussians) -> float:
+        psnr = evaluate(
+            place_model(source.model._replace(gaussians=gaussians), source.owner, source.frame),
+            views,
+            RenderSettings(
+                photographs.background, renderer=renderer, backend=get_backend(backend), conventions=PROFILES[profile]
+            ),
+        ).psnr
+        assert psnr is not None
+        return psnr
+
+    return Judge(psnr_of, f"{len(views)} of {n} training views of {photographs.name}")

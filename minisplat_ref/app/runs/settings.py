@@ -1,0 +1,354 @@
+"""The settings of a run, and their file ``config.json``."""
+
+import platform
+import reprlib
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref import __version__
+from minisplat_ref.app.runs.model_file import label_for
+from minisplat_ref.app.runs.part import read_part
+from minisplat_ref.app.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
+from minisplat_ref.constants import PROFILES
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
+from minisplat_ref.io import list_scene
+from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.frames import (
+    Unit,
+    frame_from_json,
+    frame_to_json,
+    place_fields,
+    place_population,
+    place_scene,
+    return_fields,
+    return_population,
+)
+from minisplat_ref.io.images import check_downscale
+from minisplat_ref.io.json_file import as_array
+from minisplat_ref.io.npz import read_npz
+from minisplat_ref.io.ply import save_ply
+from minisplat_ref.io.scene import Listing, build_reading, build_scene
+from minisplat_ref.mechanisms.cameras.models import check_optics
+from minisplat_ref.methods import RECIPES
+from minisplat_ref.metrics.lpips import Network, check_views, load_network
+from minisplat_ref.rendering.backends import BACKENDS, CUDA
+from minisplat_ref.strategy import importance, simplify
+from minisplat_ref.training.calibration import SHIFTS
+from minisplat_ref.training.schedule import Recipe, configure, describe, parse_settings, settings_of
+from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Model, Scene
+
+CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
+METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
+SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters of any recipe
+REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")  # those that are installed
+
+
+class Settings(NamedTuple):
+    """Everything besides the scene's files that decides the result."""
+
+    scene: str
+    """Absolute path of the scene's folder."""
+    downscale: int
+    """Factor by which the photographs are made smaller."""
+    test_every: int
+    """One view of this many is held out for testing; 0: none."""
+    undistort: bool
+    """Whether lens distortion is removed while loading."""
+    recipe: str
+    """Name of the recipe."""
+    schedule_iterations: int
+    """Number of iterations that the recipe's milestones are scaled to; stays when a run is made longer."""
+    iterations: int
+    """Iteration at which to stop."""
+    seed: int
+    """Seed of all random draws."""
+    profile: str
+    """Name of the rasteriser's conventions."""
+    backend: str
+    """Name of the backend."""
+    budget: int | None = None
+    """Gaussians that a simplification keeps at most; None for the recipe's own part of the candidates."""
+    simplify: str | None = None
+    """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
+    scene_type: str | None = None
+    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
+    extension: str | None = None
+    """Name of an extension that a recipe of the core is trained with; a recipe of an extension brings its own."""
+    set: dict[str, str] = {}  # noqa: RUF012  (never written to)
+    """Settings of the recipe's events, losses and calibrations, as text: ``--set NAME=VALUE``."""
+    eval_every: int = 0
+    """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
+    drop_bad_steps: bool = False
+    """Whether a step whose gradient is not finite is left out; otherwise it ends the training."""
+    lpips_weights: str | None = None
+    """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
+    minutes: float | None = None
+    """Time that the training may take, for a recipe that decides its own length; the result depends on the machine."""
+    max_drop: float | None = None
+    """PSNR, dB, that a simplification after the training may lose; None: there is none."""
+    max_bytes: int | None = None
+    """Size that the PLY of a simplification after the training may have; None: there is none."""
+    init: str | None = None
+    """Absolute path of the PLY or run that the training starts from, not read again; None for the scene's points."""
+    model: str | None = None
+    """Folder of the COLMAP model, relative to the scene; None for the first that is there."""
+    background: list | None = None
+    """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
+    block: str | None = None
+    """Absolute path of the part of the scene, a :class:`~minisplat_ref.app.runs.part.Part`; None for the whole."""
+
+
+def recipe_of(settings: Settings) -> Recipe:
+    """Return the recipe of a run, scaled and with what the run sets differently.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe or extension, or the recipe has no such setting.
+    """
+    recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
+    recipe = configure(recipe, **parse_settings(recipe, settings.set))
+    options = {
+        "--budget": ("budget", settings.budget),
+        "--simplify": ("choose", _choose("simplify", CHOICES, settings.simplify)),
+        "--scene-type": ("metric", _choose("scene_type", METRICS, settings.scene_type)),
+    }
+    for option, (name, value) in options.items():
+        if value is None:
+            continue
+        if name not in settings_of(recipe):
+            others = ", ".join(other.name for other in RECIPES.values() if name in settings_of(other))
+            raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
+        recipe = configure(recipe, **{name: value})
+    return recipe
+
+
+def _choose(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
+    """Return the choice of a name, None where none was made."""
+    if key is not None and str(key) not in choices:
+        raise InputError(f"{name} {key!r} is unknown; choose one of {', '.join(choices)}")
+    return None if key is None else choices[key]
+
+
+def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> None:
+    """Write the population, and the shared parameters if there are any, into the folder of a run.
+
+    Parameters
+    ----------
+    folder : Path
+    settings : Settings
+        Of the run.
+    model : Model
+        In its frame; the files are in that of the scene's files.
+    frame : Frame
+        That of the run's scene.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    model = return_model(model, owner, frame)
+    owner.save(folder / POINT_CLOUD, model.gaussians, label_for(owner, model.shared, settings.set))
+    if model.shared:
+        with replacing(folder / SHARED) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **model.shared)
+
+
+def place_model(model: Model, owner: Extension, frame: Frame) -> Model:
+    """Return a model of files in the frame of a run."""
+    if frame == FILE_FRAME:
+        return model
+    return Model(
+        place_population(model.gaussians, owner.representation.units, frame),
+        place_fields(model.shared, {**SHARED_UNITS, **owner.representation.units}, frame),
+    )
+
+
+def return_model(model: Model, owner: Extension, frame: Frame) -> Model:
+    """Return a model of a run in the frame of its scene's files."""
+    if frame == FILE_FRAME:
+        return model
+    return Model(
+        return_population(model.gaussians, owner.representation.units, frame),
+        return_fields(model.shared, {**SHARED_UNITS, **owner.representation.units}, frame),
+    )
+
+
+def load_model(folder: Path, settings: Settings) -> Model:
+    """Read what :func:`save_model` wrote, into the frame of the run.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, or the extension is.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
+    shared = read_npz(folder / SHARED, "train again") if (folder / SHARED).exists() else NOTHING
+    return place_model(Model(gaussians, shared), owner, load_frame(folder))
+
+
+def _version_of(package: str) -> str | None:
+    """Return the version of a package, None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
+    """Return what ``config.json`` holds: the settings, the recipe spelled out, and the versions that run it."""
+    versions = {package: found for package in REPORTED_PACKAGES if (found := _version_of(package)) is not None}
+    return {
+        "settings": settings._asdict(),
+        "background": scene.background.tolist(),
+        **({} if scene.frame == FILE_FRAME else {"frame": frame_to_json(scene.frame)}),
+        "recipe": describe(recipe),
+        "versions": {"minisplat_ref": __version__, "python": platform.python_version(), **versions},
+        "platform": platform.platform(),
+    }
+
+
+def load(folder: Path) -> Settings:
+    """Read the settings of a run.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, it holds no run, or one of another version.
+    """
+    config = _read_config(folder)
+    try:
+        settings = Settings(**config["settings"])
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder / CONFIG} is not the configuration of a training of this version: {error}"
+        ) from error
+    kinds = {**Settings.__annotations__, "set": dict}  # of which isinstance cannot tell what it maps to what
+    wrong = [name for name, value in settings._asdict().items() if not isinstance(value, kinds[name])]
+    if not wrong:
+        texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
+        wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
+        wrong += ["backend"] * (settings.backend not in (*BACKENDS, CUDA))
+        wrong += ["background"] * (settings.background is not None and as_array(settings.background, (3,)) is None)
+    if wrong:
+        name = wrong[0]
+        raise InputError(
+            f"{folder / CONFIG}: the setting {name} is {reprlib.repr(getattr(settings, name))}, which no training of"
+            " this version has written"
+        )
+    return settings
+
+
+def load_background(folder: Path) -> Floats:
+    """Read the colour [3] in [0, 1] behind the scene of a run.
+
+    Raises
+    ------
+    InputError
+        As for :func:`load`.
+    """
+    background = as_array(_read_config(folder).get("background"), (3,))
+    if background is None or not ((background >= 0) & (background <= 1)).all():
+        raise InputError(f"{folder / CONFIG} has no background of three numbers from 0 to 1")
+    return background
+
+
+def load_frame(folder: Path) -> Frame:
+    """Read the frame in which a run is trained, measured and rendered.
+
+    Raises
+    ------
+    InputError
+        As for :func:`load`.
+    """
+    frame = frame_from_json(_read_config(folder).get("frame"))
+    if frame is None:
+        raise InputError(f"{folder / CONFIG} has a frame without an origin of three numbers and a unit above 0")
+    return frame
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give the --out folder of a training")
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder} holds no run, {CONFIG} is missing: give the --out folder of a training")
+    return read_json_object(folder / CONFIG)
+
+
+def list_photographs(settings: Settings) -> Listing:
+    """Return what is known of the whole scene of a run before its photographs are read; errors as for the scene."""
+    return list_scene(Path(settings.scene), settings.test_every, settings.model)
+
+
+def load_photographs(settings: Settings, frame: Frame | None = None, listing: Listing | None = None) -> Scene:
+    """Load the scene of a run as it was loaded for the training.
+
+    Parameters
+    ----------
+    settings : Settings
+    frame : Frame, optional
+        That of the run; by default the one that suits the scene.
+    listing : Listing, optional
+        Of the whole scene, for who needs it, too; by default it is read, or that of the part.
+
+    Raises
+    ------
+    InputError
+        See :func:`minisplat_ref.io.load_scene`.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    part = None if settings.block is None else read_part(Path(settings.block), Path(settings.scene))
+    if listing is None:
+        listing = list_photographs(settings) if part is None else part.listing
+    cameras = [photo.camera for photo in (*listing.train_photos, *listing.test_photos)]
+    check_downscale(settings.scene, ((camera.width, camera.height) for camera in cameras), settings.downscale)
+    reading = build_reading(
+        settings.downscale,
+        settings.background,
+        settings.undistort,
+        listing.alpha_is_mask,
+        as_photographed=owner.representation.takes_optics and not settings.undistort,
+    )
+    scene = build_scene(listing, reading)
+    scene = scene if part is None else part.hide(scene)
+    for view in (*scene.train_views, *scene.test_views):
+        try:
+            check_optics(view.camera)
+        except InputError as error:
+            raise InputError(f"{settings.scene}: photograph {view.name}: {error}") from None
+    return place_scene(scene, frame)
+
+
+def check_frame(settings: Settings, scene: Scene) -> None:
+    """Refuse a scene far from the origin for an extension whose own files hold float32 alone.
+
+    Raises
+    ------
+    InputError
+        Says how far it is.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    if any(scene.frame.origin) and owner.save is not save_ply:
+        distance = float(np.linalg.norm(scene.frame.origin))
+        raise InputError(
+            f"{settings.scene} is {distance:.4g} from the origin, where files of extension {owner.name}, of float32,"
+            " cannot place it: subtract the mean of the cameras' positions from cameras and points"
+        )
+
+
+def load_lpips(settings: Settings, scene: Scene) -> Network | None:
+    """Read the network that a run's LPIPS is measured with, None where it has none, and see that it fits the views.
+
+    Raises
+    ------
+    InputError
+        The file is missing or not what it should be, or a test view is too small for the network.
+    """
+    if settings.lpips_weights is None:
+        return None
+    network = load_network(settings.lpips_weights)
+    check_views(network, scene.test_views)
+    return network

@@ -1,0 +1,84 @@
+"""What ``render`` and ``view`` show: a run, or a file of Gaussians that any program wrote, opened to be drawn."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.model_file import read_model
+from minisplat_ref.app.runs.scoring import Trained, load_trained
+from minisplat_ref.app.runs.settings import load_frame, place_model
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+from minisplat_ref.io import viewpoints
+from minisplat_ref.io.frames import frame_of_means, place_camera
+from minisplat_ref.io.viewpoints import Viewpoint
+from minisplat_ref.mechanisms.gbuffer.lighting import relight
+from minisplat_ref.types import Frame, Model
+
+
+class Source(NamedTuple):
+    """A model with its renderer, and the cameras that it was trained with."""
+
+    trained: Trained
+    """In its frame, like the cameras."""
+    cameras: list[Viewpoint]
+    """Of the run; empty for a file."""
+    path: Path
+    """What was opened."""
+    frame: Frame
+
+    def beside(self, name: str) -> Path:
+        """Return where what is made of it goes by default: inside of a run, beside a file."""
+        return self.path / name if self.path.is_dir() else self.path.with_name(f"{self.path.stem}-{name}")
+
+
+def open_source(path: Path, extension: str | None = None, environment: Path | None = None, **given: Any) -> Source:
+    """Open a run, a PLY or a compact file.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of a run, or file.
+    extension : str, optional
+        Who draws a file, ``core`` for 3DGS; by default what the file says.
+    environment : Path, optional
+        Other light for a model that is lit.
+    **given
+        ``background``, ``profile`` and ``backend`` in place of the run's; None counts as not given.
+
+    Raises
+    ------
+    InputError
+        There is no such path, it holds no model, a run has no cameras, or an option does not fit.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
+    source = _open_run(path, extension) if path.is_dir() else _open_file(path, extension)
+    given = {name: value for name, value in given.items() if value is not None}
+    if environment is not None:
+        given["model"] = relight(source.trained.model, environment)
+    return source._replace(trained=source.trained._replace(**given))
+
+
+def _open_run(folder: Path, extension: str | None) -> Source:
+    if extension is not None:
+        raise InputError(f"{folder} has its extension recorded: leave out --extension {extension}")
+    frame = load_frame(folder)
+    cameras = place_viewpoints(viewpoints.read(folder / run_folder.CAMERAS), frame)
+    return Source(load_trained(folder), cameras, folder, frame)
+
+
+def _open_file(path: Path, extension: str | None) -> Source:
+    read = read_model(path, extension)
+    frame = frame_of_means(read.population.means)
+    model = place_model(Model(read.population), read.owner, frame)
+    trained = Trained(model, read.owner.representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
+    return Source(trained, [], path, frame)
+
+
+def place_viewpoints(views: Sequence[Viewpoint], frame: Frame) -> list[Viewpoint]:
+    """Return viewpoints of the files in the frame of the model."""
+    return [view._replace(camera=place_camera(view.camera, frame)) for view in views]

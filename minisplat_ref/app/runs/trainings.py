@@ -1,0 +1,148 @@
+"""Trainings that are processes of their own, with folders from which they continue: how far one is, and what is next.
+
+A process of its own has a peak memory of its own, and when it is killed, nothing else ends.
+"""
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.settings import Settings, load
+from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import option_name
+
+SAVING_SECONDS = 5.0  # after Ctrl-C; a training that continues for longer has not been told
+PROGRAM = (sys.executable, "-m", "minisplat_ref")
+
+Status = Literal["finished", "cut off", "lost", "new"]
+"""How far a training has come: to its end, to a checkpoint, not as far, or not begun."""
+
+HEADINGS: dict[Status, str] = {
+    "finished": ": finished, kept",
+    "cut off": ": continued from its checkpoint",
+    "lost": ": has no checkpoint, started again",
+    "new": ": started",
+}
+
+REPORTED_CODES = (0, 2, 130)  # after which the training has said all there is to say
+
+
+def status_of(folder: Path, asked: Settings) -> Status:
+    """Return how far the training in a folder has come.
+
+    Raises
+    ------
+    InputError
+        The folder holds a run of other settings, or something else.
+    """
+    if not (folder / run_folder.CONFIG).exists():
+        run_folder.check_free(folder)
+        return "new"
+    ours = load(folder)
+    for name in Settings._fields:
+        is_, should = getattr(ours, name), getattr(asked, name)
+        if is_ != should:
+            raise InputError(
+                f"{folder} holds a run of other settings, {name} is {is_} and not {should}: move it away, or give"
+                " another --out"
+            )
+    if run_folder.is_finished(folder, asked.iterations):
+        return "finished"
+    has_checkpoint = any((folder / name).exists() for name in (run_folder.CHECKPOINT, run_folder.PREVIOUS))
+    return "cut off" if has_checkpoint else "lost"
+
+
+def words_to_end(folder: Path, asked: Settings, first: Sequence[str]) -> list[str] | None:
+    """Return the command that takes a training from where it is to its end, as words; None if it has ended.
+
+    What is left of a training without a checkpoint is removed.
+
+    Parameters
+    ----------
+    folder : Path
+    asked : Settings
+        That it must have.
+    first : sequence of str
+        The words that begin it.
+    """
+    status = status_of(folder, asked)
+    if status == "finished":
+        return None
+    if status == "cut off":
+        return ["train", "--resume", str(folder)]
+    if status == "lost":
+        shutil.rmtree(folder)
+    return list(first)
+
+
+def words_of(settings: Settings, folder: Path) -> list[str]:
+    """Return the command that begins a training with these settings in a folder, as words."""
+    words = ["train", settings.scene, "--out", str(folder)]
+    for name, value in settings._asdict().items():
+        if name in ("scene", "schedule_iterations", "set", "background") or value is None or value is False:
+            continue
+        words += [option_name(name)] if value is True else [option_name(name), str(value)]
+    for name, text in settings.set.items():
+        words += ["--set", f"{name}={text}"]
+    if settings.background is not None:
+        words += ["--background", ",".join(str(round(255 * value)) for value in settings.background)]
+    return words
+
+
+def train_here(words: Sequence[str]) -> int:
+    """Carry out a command in a process here; return its exit code.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C or SIGTERM, when it has saved what there is.
+    CalledProcessError
+        It has been killed or has a programming error.
+    """
+    command = [*PROGRAM, *words]
+    with subprocess.Popen(command) as process, _raising_terminated():
+        try:
+            code = process.wait()
+        except _Terminated:
+            process.terminate()  # it saves now, as after Ctrl-C, however long that takes
+            process.wait()
+            raise
+        except KeyboardInterrupt:
+            # A terminal's Ctrl-C has reached the training, too, which saves now and is better left alone.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(SAVING_SECONDS)
+            process.send_signal(signal.SIGINT)  # does nothing when the training has ended
+            process.wait()
+            raise
+    if code not in REPORTED_CODES:
+        raise subprocess.CalledProcessError(code, command)
+    return code
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which the system sends to this process alone, while Ctrl-C reaches its trainings too."""
+
+
+@contextlib.contextmanager
+def _raising_terminated() -> Iterator[None]:
+    """Make SIGTERM raise :class:`_Terminated`, in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def raise_terminated(number: int, frame: FrameType | None) -> None:
+        raise _Terminated
+
+    previous = signal.signal(signal.SIGTERM, raise_terminated)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)

@@ -1,0 +1,142 @@
+"""``compare --workers``: the same models as in turn, also after a worker is killed; what cannot work is one line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("distributed")
+
+from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs import cluster
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+
+SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+OPTIONS = ["--recipes", "3dgs-accel", "--seeds", "0,1", "--iterations", "6", "--test-every", "4", "--eval-every", "2"]
+RUNS = ("3dgs-accel-seed0", "3dgs-accel-seed1")
+MEASURED = ("psnr", "ssim", "n_gaussians")
+
+pytestmark = pytest.mark.filterwarnings("default")  # Dask leaves sockets to the garbage collector
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "nook"
+    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def in_turn(scene_folder, tmp_path_factory):
+    return compare(scene_folder, tmp_path_factory.mktemp("turn") / "out", "--workers", "0")
+
+
+def compare(scene_folder, out, *options):
+    assert main(["compare", str(scene_folder), *OPTIONS, "--out", str(out), *options]) == 0
+    return out
+
+
+def results(folder):
+    """Everything that does not depend on the clock."""
+    means = [
+        {key: recipe["mean"][key] for key in MEASURED}
+        for recipe in json.loads((folder / "compare.json").read_text())["recipes"]
+    ]
+    return means, [(folder / run / "point_cloud.ply").read_bytes() for run in RUNS]
+
+
+@pytest.mark.parametrize("n", [2, pytest.param(1, marks=pytest.mark.slow)])
+def test_workers_give_the_same_bytes(scene_folder, in_turn, tmp_path, n):
+    out = compare(scene_folder, tmp_path / "out", "--workers", str(n))
+    assert results(out) == results(in_turn)
+    assert not list(out.glob(f"{cluster.TOKEN}*"))
+
+
+def test_a_scheduler_elsewhere_gives_the_same_bytes(scene_folder, in_turn, tmp_path):
+    """Scheduler and worker are programs of their own, as on other machines."""
+    contact, plain = tmp_path / "scheduler.json", ["--scheduler-file", str(tmp_path / "scheduler.json")]
+    commands = (
+        ["dask_scheduler", *plain, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"],
+        ["dask_worker", *plain, "--nthreads", "1", "--no-dashboard"],
+    )
+    programs = []
+    try:
+        for module, *words in commands:
+            call = [sys.executable, "-m", f"distributed.cli.{module}", *words]
+            programs.append(subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path))
+            while not contact.exists():
+                assert programs[0].poll() is None
+                time.sleep(0.05)
+        out = compare(scene_folder, tmp_path / "out", "--cluster", json.loads(contact.read_text())["address"])
+    finally:
+        for program in reversed(programs):
+            program.terminate()
+            program.wait()
+    assert results(out) == results(in_turn)
+
+
+def test_a_killed_worker_loses_nothing(scene_folder, in_turn, tmp_path, monkeypatch):
+    killed = []
+    check = cluster._check
+
+    def kill_soon(client, site):
+        check(client, site)
+
+        def kill():
+            while not any((tmp_path / "out" / run).exists() for run in RUNS):
+                time.sleep(0.02)
+            os.kill(next(iter(pids.values())), signal.SIGKILL)
+            killed.append(True)
+
+        pids = client.run(os.getpid)
+        threading.Thread(target=kill, daemon=True).start()
+
+    monkeypatch.setattr(cluster, "_check", kill_soon)
+    out = compare(scene_folder, tmp_path / "out", "--workers", "1")
+    assert killed and results(out) == results(in_turn)
+
+
+def refused(scene_folder, out, capfd, *options):
+    capfd.readouterr()
+    assert main(["compare", str(scene_folder), *OPTIONS, "--out", str(out), *options]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert not out.exists()
+    return line
+
+
+def test_no_scheduler_is_one_line(scene_folder, in_turn, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
+    line = refused(scene_folder, tmp_path / "out", capfd, "--cluster", "tcp://127.0.0.1:9")
+    assert "no scheduler answers at tcp://127.0.0.1:9: start one" in line
+
+
+def test_another_version_is_one_line(scene_folder, in_turn, tmp_path, capfd, monkeypatch):
+    ours = cluster.versions() | {"minisplat_ref": "9.9"}
+    call = cluster._check.__globals__["versions"]
+    monkeypatch.setattr(cluster, "_check", lambda client, site: check_against(client, site, call, ours, monkeypatch))
+    line = refused(scene_folder, tmp_path / "out", capfd, "--workers", "1")
+    assert "has minisplat_ref" in line and "and not 9.9: install the same there" in line
+
+
+def check_against(client, site, call, ours, monkeypatch):
+    theirs = client.run(call)
+    client.run = lambda function, *args, **named: theirs
+    monkeypatch.setattr(cluster, "versions", lambda: ours)
+    check(client, site)
+
+
+check = cluster._check
+
+
+def test_a_path_that_a_worker_does_not_see_is_one_line(tmp_path):
+    site = cluster.Site(tmp_path, tmp_path, (tmp_path / "absent",))
+    assert cluster.unseen(site) == str(tmp_path / "absent")
+    assert "put it on storage that all workers share" in cluster.unseen_line("w", "p")
+    assert cluster.unseen(site._replace(inputs=(Path("/"),))) is None
