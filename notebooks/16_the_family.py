@@ -52,8 +52,8 @@ from minisplat_ref.extensions.omg.reference import distinct_importance, local_di
 from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
+from minisplat_ref.io.packing.container import parse
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
-from minisplat_ref.mechanisms.packing.container import parse
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr

@@ -28,10 +28,10 @@ from data_tools.claims.kit.figures import plot_deviations, set_ticks, with_devia
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression.msz import MSZ
-from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats.spz import SPZ
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from data_tools.foreign_files.building import command, done, refused
 from minisplat_ref.errors import InputWarning
-from minisplat_ref.extensions.compression import spz
 from minisplat_ref.io import load_ply, load_points, read_image, save_ply
+from minisplat_ref.io.formats import spz
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.types import Gaussians
 

@@ -13,6 +13,7 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders, module_of
 from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats.catalogue import FORMATS
 from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES
@@ -58,7 +59,7 @@ class Extension(NamedTuple):
         return NO_LABEL if is_plain or self.saves_plain else Label(self.name)
 
 
-CORE = Extension("core")
+CORE = Extension("core", formats=FORMATS)
 """What there is without any extension."""
 
 
@@ -218,5 +219,5 @@ def find_format(path: str | Path) -> Format | None:
 
 
 def all_formats() -> list[tuple[str, Format]]:
-    """Return every format behind the name of its extension."""
-    return [(extension.name, format_) for extension in load_extensions() for format_ in extension.formats]
+    """Return every format behind the name of its extension, those of the core first."""
+    return [(extension.name, format_) for extension in (CORE, *load_extensions()) for format_ in extension.formats]

@@ -5,7 +5,6 @@
 :mod:`.tangent`     footprints on tangent planes of the unit sphere, each pixel with its own order
 :mod:`.peeling`     translucent triangle meshes by depth peeling, with gradients
 :mod:`.payload`     footprints of 3DGS with data that change their pixels: a texture, a cut, vertices
-:mod:`.packing`     compact files: Morton order, planes of bytes, a container
 :mod:`.editing`     Gaussians under a deformation, with rotated colours
 :mod:`.meshes`      triangle meshes, their files and distances; fans of triangles from flat Gaussians, and back
 :mod:`.fusion`      depth maps of many views as one surface (TSDF), which the command ``mesh`` needs, too

@@ -27,10 +27,11 @@ from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref import load_ply
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.compression import lattice, levels, msz, spz
+from minisplat_ref.extensions.compression import lattice, levels, msz
 from minisplat_ref.io import load_scene
-from minisplat_ref.mechanisms.packing import container as container
-from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.io.formats import spz
+from minisplat_ref.io.packing import container as container
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
 from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, QUATERNION_FLOAT32

@@ -113,7 +113,7 @@ def test_the_table_names_what_there_is():
 
 
 def module_at(file):
-    return importlib.import_module("minisplat_ref." + file.removesuffix(".py").replace("/", "."))
+    return importlib.import_module("minisplat_ref." + file.removesuffix(".py").strip("/").replace("/", "."))
 
 
 # The extension that the page spells out

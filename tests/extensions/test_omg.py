@@ -438,11 +438,11 @@ def test_study(folders, tmp_path, capsys):
     command = ["omg/distinctiveness", str(nook), "--fine-tune", "3", "--seeds", "0", "--ply"]
     save_ply(tmp_path / "two.ply", take(load_ply(run / "point_cloud.ply"), np.arange(2)))
     few = [*command, str(tmp_path / "two.ply"), "--out", str(tmp_path / "few")]
-    assert main(few) == 2  # two Gaussians differ from each other alike: both choices keep the same
+    assert measure_claim(few) == 2  # two Gaussians differ from each other alike: both choices keep the same
     assert "'with distinctiveness' measured exactly what 'importance' did" in capsys.readouterr().err
     save_ply(tmp_path / "more.ply", initial_state(load_scene(nook), get_recipe("3dgs"), seed=0).gaussians)
     more = [*command, str(tmp_path / "more.ply"), "--out", str(tmp_path / "out")]
-    assert main(more) == 0
+    assert measure_claim(more) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     rows = result["runs"][0]
     assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]

@@ -16,8 +16,8 @@ from compact import population, rotation_error
 from data_tools.foreign_files.ksplat import write_ksplat
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.compression import compressed_ply, glb, ksplat, sog, splat, spz
 from minisplat_ref.io import load_ply, save_ply
+from minisplat_ref.io.formats import compressed_ply, glb, ksplat, sog, splat, spz
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.types import Gaussians

@@ -11,10 +11,10 @@ from numpy.testing import assert_array_equal
 from compact import population, with_header
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.extensions.compression.msz import MSZ
-from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.extensions.omg.file import OMG_FILE
 from minisplat_ref.io import label as labels
 from minisplat_ref.io.formats import label_of, with_label, write_file
+from minisplat_ref.io.formats.spz import SPZ
 from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, read_label, save_ply
 from minisplat_ref.io.ply_file import read_vertices

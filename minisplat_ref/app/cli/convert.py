@@ -16,10 +16,14 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
-compact file. The suffix of OUT says what is written: .ply is the 3DGS layout
-with every float; compact formats and their levels of precision, of which 0 is
-the finest, come with extensions (see minisplat-ref extensions compression);
-.html is one page to send, which shows the scene in a browser, without network.
+compact file. The suffix of OUT says what is written:
+
+  .ply    the 3DGS layout with every float
+  .spz .sog .splat .glb .compressed.ply   for other programs
+  .msz    ours, with a stated error (see minisplat-ref extensions compression)
+  .html   one page to send, which shows the scene in a browser, offline
+
+Compact formats have levels of precision, of which 0 is the finest:
 
   --max-bytes B   the finest level whose file has at most B bytes
   --max-drop dB   the coarsest level that loses at most so much PSNR, measured

@@ -12,32 +12,20 @@ which bounds the error of each number exactly, and which a second encoding does 
 (:mod:`minisplat_ref.extensions.compression.lattice`). Centres are stored as differences, bytes of equal significance
 are stored together, and zstandard packs them. There are 13 levels; level 0 keeps each float32.
 
-The others are for other programs: ``.spz`` (:mod:`minisplat_ref.extensions.compression.spz`), Niantic's, versions 2 to
-4; ``.splat`` (:mod:`.splat`), of the first viewers in the browser; ``.sog`` (:mod:`.sog`) and ``.compressed.ply``
-(:mod:`.compressed_ply`), of SuperSplat and PlayCanvas; ``.glb`` (:mod:`.glb`), glTF with its extension for Gaussians;
-and ``.ksplat`` (:mod:`.ksplat`), which is only read.
-
     minisplat-ref convert runs/fox fox.msz --max-drop 0.1
     minisplat-ref convert fox.msz fox.ply
     python -m data_tools.claims compression/rate-distortion SCENE --out DIR
 
 The order of the Gaussians is not preserved; only ties in depth depend on it. Quaternions come back with another length,
 which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that draws
-these six in its own way is recorded, by ``.msz`` in its header, by the others in a file beside it
-(:mod:`minisplat_ref.io.label`).
+these six in its own way is recorded in the header. Other programs' formats are in :mod:`minisplat_ref.io.formats`.
 
 Left out are pruning, merging and training with the quantiser in the loop, which gain more than any entropy coder;
 vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.md`` has the measured figures.
 """
 
-from minisplat_ref.extensions.compression.compressed_ply import COMPRESSED_PLY
-from minisplat_ref.extensions.compression.glb import GLB
-from minisplat_ref.extensions.compression.ksplat import KSPLAT
 from minisplat_ref.extensions.compression.msz import MSZ
-from minisplat_ref.extensions.compression.sog import SOG
-from minisplat_ref.extensions.compression.splat import SPLAT
-from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.extensions.extension import Extension
 
-EXTENSION = Extension("compression", formats=(MSZ, SPZ, SPLAT, SOG, COMPRESSED_PLY, GLB, KSPLAT))
-"""The formats of this project and of other programs."""
+EXTENSION = Extension("compression", formats=(MSZ,))
+"""The format of this project."""

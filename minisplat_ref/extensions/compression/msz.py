@@ -24,7 +24,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression import lattice, levels
 from minisplat_ref.extensions.compression.levels import Exponents
 from minisplat_ref.io.formats import Format
-from minisplat_ref.mechanisms.packing.container import (
+from minisplat_ref.io.packing.container import (
     WAY_OUT,
     Container,
     Packed,
@@ -35,8 +35,8 @@ from minisplat_ref.mechanisms.packing.container import (
     unpack,
     write_label,
 )
-from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.io.packing.morton import morton_order
+from minisplat_ref.io.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.packing.planes import unzigzag, zigzag
+from minisplat_ref.io.packing.planes import unzigzag, zigzag
 from minisplat_ref.types import Floats
 
 LARGEST_HALF = 65504.0

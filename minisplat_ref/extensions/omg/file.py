@@ -29,7 +29,7 @@ from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_
 from minisplat_ref.extensions.omg.svq import QUAT_MIN, Quantised, quantise, unit_quats
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label
-from minisplat_ref.mechanisms.packing.container import (
+from minisplat_ref.io.packing.container import (
     Container,
     Packed,
     is_count,
@@ -39,8 +39,8 @@ from minisplat_ref.mechanisms.packing.container import (
     unpack,
     write_label,
 )
-from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import to_planes
+from minisplat_ref.io.packing.morton import morton_order
+from minisplat_ref.io.packing.planes import to_planes
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 

@@ -8,8 +8,8 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.omg.centers import FARTHEST
 from minisplat_ref.extensions.omg.svq import Quantised
-from minisplat_ref.mechanisms.packing.container import WAY_OUT, Packed, is_count, unpack
-from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes
+from minisplat_ref.io.packing.container import WAY_OUT, Packed, is_count, unpack
+from minisplat_ref.io.packing.planes import PLANES_MAX, from_planes
 from minisplat_ref.types import Ints
 
 GAUSSIANS_MAX = 2**31 - 1

@@ -11,7 +11,7 @@ Its cells have the proportions of the box that the centres fill, as in the relea
 
 import numpy as np
 
-from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.types import Floats
 
 

@@ -26,10 +26,10 @@ from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_
 from minisplat_ref.extensions.omg.decoding import split_codes
 from minisplat_ref.extensions.omg.population import CODEBOOKS, PLACE, SIZES, OmgGaussians
 from minisplat_ref.extensions.omg.renderer import decode as decode_model
+from minisplat_ref.io.packing.container import Container, Packed, is_count, pack, parse, unpack
+from minisplat_ref.io.packing.morton import morton_order
+from minisplat_ref.io.packing.planes import from_planes, to_planes
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-from minisplat_ref.mechanisms.packing.container import Container, Packed, is_count, pack, parse, unpack
-from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import from_planes, to_planes
 from minisplat_ref.types import Floats, Frame, Gaussians, Ints, Model
 from minisplat_ref.validation import check_gaussians
 

@@ -13,11 +13,11 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs import conversion
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import extension as extension_module
-from minisplat_ref.extensions.compression import levels, msz, spz
+from minisplat_ref.extensions.compression import levels, msz
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
-from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats import Format, spz
 from minisplat_ref.io.label import Label
-from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.training.calibration import EXPOSURES
 
 LEVELS = range(levels.N_LEVELS)
@@ -161,7 +161,7 @@ def test_a_drop_is_measured_with_the_exposures_of_the_run(run):
 def test_what_convert_refuses(run, tmp_path, one_line):
     assert "has levels 0 to 12" in one_line("convert", run, tmp_path / "a.msz", "--level", "13")
     assert "a PLY has one precision" in one_line("convert", run, tmp_path / "a.ply", "--max-bytes", "9")
-    assert ".ply or .msz or .spz" in one_line("convert", run, tmp_path / "a.xyz")
+    assert ".ply or .spz or .splat" in one_line("convert", run, tmp_path / "a.xyz")
     assert "are for --max-drop" in one_line("convert", run, tmp_path / "a.msz", "--scene", run)
     assert "has its extension recorded" in one_line("convert", run, tmp_path / "a.msz", "--extension", "velocity")
     (tmp_path / "bad.msz").write_bytes(b"MSZ\n")
@@ -206,4 +206,4 @@ def test_compact_files_are_drawn_and_measured_and_described(run, tmp_path, capsy
     out = capsys.readouterr().out
     assert "0: every float32" in out and "Gaussians" in out and "60" in out
     assert main(["extensions", "compression"]) == 0
-    assert ".msz (lattices of 13 precisions, zstandard), .spz" in capsys.readouterr().out
+    assert "formats   .msz (lattices of 13 precisions, zstandard)" in capsys.readouterr().out

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.extensions.compression.levels8 import (
+from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
     color_bytes,
@@ -28,7 +29,6 @@ from minisplat_ref.extensions.compression.levels8 import (
     scales_of,
     sh_dc_of,
 )
-from minisplat_ref.io.formats import Format
 from minisplat_ref.types import Gaussians
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])

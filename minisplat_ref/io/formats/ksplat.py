@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.compression.levels8 import WAY_OUT, finish, logits_of, refuse_size, sh_dc_of
 from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats.levels8 import WAY_OUT, finish, logits_of, refuse_size, sh_dc_of
 from minisplat_ref.types import Floats, Gaussians
 
 HEADER_BYTES, SECTION_BYTES = 4096, 1024

@@ -44,9 +44,8 @@ from numpy.typing import NDArray
 from minisplat_ref import memory
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.extensions.compression import spz_streams
 from minisplat_ref.interface.progress import progress_bar
-from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats import Format, spz_streams
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 

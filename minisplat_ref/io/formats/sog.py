@@ -32,7 +32,9 @@ from PIL import Image
 from minisplat_ref import memory
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.compression.levels8 import (
+from minisplat_ref.interface.progress import with_progress
+from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
     finish,
@@ -41,9 +43,7 @@ from minisplat_ref.extensions.compression.levels8 import (
     with_largest,
     without_largest,
 )
-from minisplat_ref.interface.progress import with_progress
-from minisplat_ref.io.formats import Format
-from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 VERSION = 2

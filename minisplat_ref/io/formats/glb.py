@@ -31,7 +31,8 @@ import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.compression.levels8 import (
+from minisplat_ref.io.formats import GLTF_AXES, Format
+from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
     color_bytes,
@@ -40,7 +41,6 @@ from minisplat_ref.extensions.compression.levels8 import (
     refuse_size,
     scales_of,
 )
-from minisplat_ref.io.formats import GLTF_AXES, Format
 from minisplat_ref.types import Floats, Gaussians
 
 NAME = "KHR_gaussian_splatting"

@@ -16,10 +16,10 @@ from compact import population, refusal, refused_line, rotation_error
 from data_tools.foreign_files.ksplat import write_ksplat
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.extensions.compression import compressed_ply, glb, ksplat, levels8, sog, splat
 from minisplat_ref.extensions.extension import find_format
 from minisplat_ref.io import load_ply, save_ply
-from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.io.formats import compressed_ply, glb, ksplat, levels8, sog, splat
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Gaussians
 from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.packing.container import pack_frame, unpack_frame
+from minisplat_ref.io.packing.container import pack_frame, unpack_frame
 
 MAGIC = 0x5053474E  # "NGSP"
 VERSION = 4

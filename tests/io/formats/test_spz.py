@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from compact import population, refusal, rotation_error
 from minisplat_ref import load_ply
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.compression import spz
+from minisplat_ref.io.formats import spz
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Gaussians
 from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32

@@ -1,7 +1,14 @@
-"""A compact file format of Gaussians: a suffix, levels of precision, and a pair of functions.
+"""Compact file formats of Gaussians: a suffix, levels of precision, and a pair of functions.
 
-A PLY stores every float. A format stores less, at one of several levels, and says how much may be lost. Formats belong
-to extensions: ``minisplat_ref.extensions.extension.find_format`` finds them by the suffix of a file.
+A PLY stores every float. A format stores less, at one of several levels, and says how much may be lost. Those of other
+programs are here, :mod:`.catalogue`: ``.spz`` (:mod:`.spz`), Niantic's, versions 2 to 4; ``.splat`` (:mod:`.splat`), of
+the first viewers in the browser; ``.sog`` (:mod:`.sog`) and ``.compressed.ply`` (:mod:`.compressed_ply`), of SuperSplat
+and PlayCanvas; ``.glb`` (:mod:`.glb`), glTF with its extension for Gaussians; and ``.ksplat`` (:mod:`.ksplat`), only
+read. An extension may bring further ones. ``minisplat_ref.extensions.extension.find_format`` finds all by the
+suffix of a file.
+
+They hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that draws these six in its own
+way is recorded in a file beside theirs (:mod:`minisplat_ref.io.label`).
 """
 
 from collections.abc import Callable

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.compression.levels8 import (
+from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
     finish,
@@ -34,9 +35,8 @@ from minisplat_ref.extensions.compression.levels8 import (
     with_largest,
     without_largest,
 )
-from minisplat_ref.io.formats import Format
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.io.ply_file import read_header
-from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.types import Floats, Gaussians
 
 CHUNK = 256  # Gaussians

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.mechanisms.packing.morton import cells_of, morton_codes, morton_order
-from minisplat_ref.mechanisms.packing.planes import from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.io.packing.morton import cells_of, morton_codes, morton_order
+from minisplat_ref.io.packing.planes import from_planes, to_planes, unzigzag, zigzag
 
 # Morton order and planes of bytes
 
