@@ -453,5 +453,5 @@ def test_study(folders, tmp_path, capsys):
     assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in images of 32 x 24
     assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
     assert "textured half" in capsys.readouterr().out
-    assert main(more) == 0  # continues: there is nothing left to measure
+    assert measure_claim(more) == 0  # continues: there is nothing left to measure
     assert json.loads((tmp_path / "out" / "result.json").read_text()) == result

@@ -226,7 +226,7 @@ def test_the_study_prints_what_it_measures(capsys):
     assert rows[0] == ["recipe", "PSNR dB", "error of velocities"] and rows[2][0] == "3dgs-accel"
     assert rows[3] == ["velocity", f"{expected.psnr:.2f}", f"{expected.velocity_rmse:.4f}"]
     assert measure_claim(["velocity/rest"]) == 2
-    assert "there is no study 'velocity/rest'" in capsys.readouterr().err
+    assert "there is no claim 'velocity/rest'" in capsys.readouterr().err
 
 
 # From a folder of photographs to images
