@@ -10,8 +10,8 @@ threshold of the renderer's own, a gate or a ReLU: its stage belongs in the exte
 the name that the whole renderer has here replaces it.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.oracle.setting import POSE, Setting, make_setting
 from minisplat_ref.oracle.stages import Stage, watch
+from minisplat_ref.reference.hits import TileHits
 from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
@@ -33,6 +34,16 @@ NOISE = 0.1  # standard deviation: the Gaussians lie at depth 3 and are 0.1 to 0
 N_POINTS = 6
 
 Stages = Callable[[Backend, Setting, np.random.Generator], Sequence[Stage]]
+
+
+class Drawn(NamedTuple):
+    """A model that has been rendered, of which a relative says on which sides of its kinks it is."""
+
+    model: Model
+    view: View
+    request: Request
+    tape: Any
+    """Of the renderer."""
 
 
 def check_model_gradients(
@@ -97,7 +108,16 @@ def model_stages(
     return (*(stage for stage in whole if stage.name not in names), *further)
 
 
-def model_stage(backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator) -> Stage:
+def model_stage(
+    backend: Backend,
+    setting: Setting,
+    representation: Representation,
+    rng: np.random.Generator,
+    *,
+    wants: frozenset[str] | None = None,
+    sides_of: Callable[[Drawn], Sequence[np.ndarray]] = lambda drawn: (),
+    fixed: Sequence[str] = (),
+) -> Stage:
     """Return a renderer as a function of every field, every shared parameter, the background and the pose.
 
     The background is left out where the image does not depend on it, as behind a sky of the renderer's own, and so are
@@ -113,23 +133,32 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
         Makes the population and the shared parameters, and draws them.
     rng : Generator
         For the noise.
+    wants : frozenset of str, optional
+        Channels that are rendered besides RGB; by default depth, where the renderer has it.
+    sides_of : callable, optional
+        Returns on which sides of the renderer's own kinks a rendered model is: which hits are blended, which ReLUs are
+        on, which cells are read. Differences across one of them are refused. The calls of the backend's stages record
+        theirs without it.
+    fixed : sequence of str, optional
+        Further fields and shared parameters that are not differentiated.
     """
     renderer, view = representation.renderer, training_view(setting.camera)
     (population, shared), _ = noisy_model(setting, view, representation, rng)
     fields = population._asdict()
-    wants = frozenset({"depth"} & renderer.channels(frozenset({"depth"})).keys())
+    wants = frozenset({"depth"} & renderer.channels(frozenset({"depth"})).keys()) if wants is None else wants
     all_parameters = {**fields, **shared}
-    still = {name for name, rate in representation.rates.of.items() if rate == 0}
+    still = {*fixed, *(name for name, rate in representation.rates.of.items() if rate == 0)}
     held = {name: array for name, array in all_parameters.items() if name in still}
     free = {name: array for name, array in all_parameters.items() if name not in still}
     inputs = {**free, "background": setting.background, **setting.pose}
 
-    def draw(arrays: dict[str, Floats], used: Backend) -> tuple[RenderOutput, Any]:
+    def draw(arrays: dict[str, Floats], used: Backend) -> tuple[RenderOutput, Drawn]:
         model = Model(population._make(arrays[name] for name in fields), {name: arrays[name] for name in shared})
         R, t = (arrays[name] for name in POSE)
-        moved = view.camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+        moved = view._replace(camera=view.camera._replace(cam_from_world_R=R, cam_from_world_t=t))
         request = Request(arrays["background"], conventions=setting.conventions, backend=used, wants=wants)
-        return renderer.render(model, view._replace(camera=moved), request)
+        output, tape = renderer.render(model, moved, request)
+        return output, Drawn(model, moved, request, tape)
 
     over_black = draw({**held, **inputs, "background": np.zeros(3)}, backend)[0].image
     if np.array_equal(draw({**held, **inputs}, backend)[0].image, over_black):
@@ -140,12 +169,12 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
 
     def function(*args: Floats) -> Point:
         on_watch, sides = watch(backend)
-        output, _ = draw(arrays_of(args), on_watch)
-        return Point((output.image, output.alpha), tuple(sides))
+        output, drawn = draw(arrays_of(args), on_watch)
+        return Point((output.image, output.alpha), (*sides, *sides_of(drawn)))
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
-        _, tape = draw(arrays_of(tuple(inputs.values())), backend)
-        v = renderer.render_vjp(tape, v_image, v_alpha)
+        _, drawn = draw(arrays_of(tuple(inputs.values())), backend)
+        v = renderer.render_vjp(drawn.tape, v_image, v_alpha)
         by_name = {
             **v.gaussians._asdict(),
             **{name: v.shared.get(name, np.zeros_like(array)) for name, array in shared.items()},
@@ -154,6 +183,12 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
         return tuple(by_name[name] for name in inputs)
 
     return Stage(f"render {representation.name}", inputs, ("image", "alpha"), function, vjp)
+
+
+def hit_sides(tiles: Iterable[TileHits]) -> list[np.ndarray]:
+    """Return which hits of the tiles of an image are blended, and which of them are clamped."""
+    pairs = [(np.ravel(tile.alphas > 0), np.ravel(tile.is_clamped)) for tile in tiles]
+    return [np.concatenate(sides) for sides in zip(*pairs, strict=True)]
 
 
 def noisy_model(

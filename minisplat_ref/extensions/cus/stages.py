@@ -37,7 +37,7 @@ from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.losses import Cotangents
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, Scene, View
+from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 
 CHILDREN, LATENT, HIDDEN, EMBEDDING, QUERY = 2, 2, 5, 4, 4
 N_REMEMBERED, N_CHANNELS = 3, 5
@@ -102,25 +102,12 @@ OF_QUERIES = ("query_mix_weights_0", "query_mix_biases_0", MEMORY, KEYS, ADAPTER
 
 
 def _renderer_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
-    recorded: list[tuple[Any, ...]] = []
-
-    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        recorded[:] = [_sides(model, view)]
-        return ANCHORS.renderer.render(model, view, request)
-
     representation = small(rng)
     unseen = [name for name in representation.shared(_scene(setting), rng) if name.startswith("query")]
     representation = representation._replace(
-        renderer=ANCHORS.renderer._replace(render=watched),
-        rates=Rates(dict.fromkeys(("sh_rest", *unseen, *OF_QUERIES), 0.0), frozenset()),
+        rates=Rates(dict.fromkeys(("sh_rest", *unseen, *OF_QUERIES), 0.0), frozenset())
     )
-    stage = model_stage(backend, setting, representation, rng)
-
-    def function(*args: Floats) -> Point:
-        point = stage.function(*args)
-        return point._replace(sides=(*point.sides, *recorded[0]))
-
-    return stage._replace(function=function)
+    return model_stage(backend, setting, representation, rng, sides_of=lambda drawn: _sides(drawn.model, drawn.view))
 
 
 def _scene(setting: Setting) -> Scene:

@@ -20,8 +20,7 @@ from minisplat_ref.extensions.omg.population import (
 from minisplat_ref.extensions.omg.renderer import COMPACT, FIELDS, make_renderer
 from minisplat_ref.mechanisms.networks.mlp import make_network, to_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-from minisplat_ref.oracle.differences import Point
-from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.oracle.models import Drawn, model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import Backend
@@ -79,16 +78,13 @@ def _stage(
         renderer=make_renderer(lambda means, shared, networks: encoding),
         rates=Rates(dict.fromkeys(held, 0.0), frozenset()),
     )
-    stage = model_stage(backend, setting, representation, rng)
 
-    def function(*args: Floats) -> Point:
-        by_name = dict(zip(stage.inputs, args, strict=True))
-        features = by_name.get("features")
-        if features is None:
-            rows = split_codes(population.codes, by_name, tuple(FIELDS))["feature_codes"]
-            features = gather(by_name["feature_codes"], rows)
-        tapes = run_networks(features, encoding, by_name, IN_NUMPY).tapes
-        point = stage.function(*args)
-        return point._replace(sides=(*point.sides, *(inputs[1] > 0 for inputs in tapes.values())))
+    def sides(drawn: Drawn) -> list[np.ndarray]:
+        features, shared = drawn.model.gaussians.features, drawn.model.shared
+        if has_codes:
+            rows = split_codes(population.codes, shared, tuple(FIELDS))["feature_codes"]
+            features = gather(shared["feature_codes"], rows)
+        tapes = run_networks(features, encoding, shared, IN_NUMPY).tapes
+        return [inputs[1] > 0 for inputs in tapes.values()]
 
-    return stage._replace(function=function)
+    return model_stage(backend, setting, representation, rng, sides_of=sides)

@@ -14,14 +14,12 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.satellite.affine_fit import AFFINE
 from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE
 from minisplat_ref.extensions.satellite.reference import MIN_ALPHA
-from minisplat_ref.extensions.satellite.renderer import CHANNELS, Tape, channels, render
-from minisplat_ref.oracle.differences import Point
-from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.extensions.satellite.renderer import CHANNELS, Tape
+from minisplat_ref.oracle.models import Drawn, model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
-from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.types import Camera, Floats, Model, Optics, RenderOutput, View
+from minisplat_ref.types import Camera, Optics
 
 ALL = frozenset(CHANNELS)
 TIE = 1e-12
@@ -44,30 +42,15 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
 
 
 def _stage(backend: Backend, setting: Setting, camera: Camera, name: str, rng: np.random.Generator) -> Stage:
-    sides: list[np.ndarray] = []
+    named = SEEN_FROM_ABOVE._replace(name=name)
+    seen = setting._replace(camera=camera)
+    return model_stage(backend, seen, named, rng, wants=ALL, sides_of=_sides, fixed=("sh_rest",))  # which is empty
 
-    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Tape]:
-        output, tape = render(model, view, request._replace(wants=ALL))
-        assert tape.of_sun is not None and tape.shadow is not None
-        faint = [part.output.alpha > MIN_ALPHA for part in (tape.seen, tape.of_sun)]
-        inside = np.abs(tape.shadow.sampled.slopes) > TIE
-        is_shaded, is_lit = tape.shadow.shadows < 1 - TIE, SH_C0 * model.gaussians.sh_dc + 0.5 > 0
-        sides[:] = [*faint, is_shaded, tape.shadow.sampled.corners, inside, is_lit]
-        return output, tape
 
-    renderer = SEEN_FROM_ABOVE.renderer._replace(render=watched, channels=lambda wants: channels(ALL))
-    named = SEEN_FROM_ABOVE._replace(name=name, renderer=renderer)
-    made = model_stage(backend, setting._replace(camera=camera), named, rng)
-
-    inputs = {name: array for name, array in made.inputs.items() if name != "sh_rest"}  # which is empty
-
-    def function(*args: Floats) -> Point:
-        named = {**made.inputs, **dict(zip(inputs, args, strict=True))}
-        point = made.function(*(named[name] for name in made.inputs))
-        return Point(point.outputs, (*point.sides, *sides))
-
-    def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
-        found = dict(zip(made.inputs, made.vjp(v_image, v_alpha), strict=True))
-        return tuple(found[name] for name in inputs)
-
-    return made._replace(inputs=inputs, function=function, vjp=vjp)
+def _sides(drawn: Drawn) -> list[np.ndarray]:
+    tape: Tape = drawn.tape
+    assert tape.of_sun is not None and tape.shadow is not None
+    faint = [part.output.alpha > MIN_ALPHA for part in (tape.seen, tape.of_sun)]
+    inside = np.abs(tape.shadow.sampled.slopes) > TIE
+    is_shaded, is_lit = tape.shadow.shadows < 1 - TIE, SH_C0 * drawn.model.gaussians.sh_dc + 0.5 > 0
+    return [*faint, is_shaded, tape.shadow.sampled.corners, inside, is_lit]

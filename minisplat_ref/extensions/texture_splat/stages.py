@@ -12,43 +12,37 @@ from minisplat_ref.extensions.texture_splat.population import with_textures
 from minisplat_ref.extensions.texture_splat.reference import REACH, TILT_MAX
 from minisplat_ref.extensions.texture_splat.renderer import render
 from minisplat_ref.mechanisms.gbuffer.population import WITH_OCCLUSION
-from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape
 from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.mechanisms.surfels.renderer import Shown
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
-from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.models import Drawn
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
-from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 TEXELS = 3  # the smallest texture that has a kink inside
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return the whole renderer, by its own name."""
-    sides: list[np.ndarray] = []
-
-    def watched(
-        model: Model, view: View, request: Request, visibility: Floats | None = None
-    ) -> tuple[RenderOutput, ReflectiveTape]:
-        output, tape = render(model, view, request, visibility)
-        tilts = np.sum(np.tanh(model.gaussians.normal_textures.reshape(-1, 2)) ** 2, axis=1)
-        sides[:] = [*cells_of(tape.blend.shown, TEXELS), tilts < TILT_MAX]
-        return output, tape
-
     representation = TEXTURED_SURFELS._replace(extend=partial(with_textures, texels=TEXELS))
     stage = shading_stage(
-        backend, setting, rng, representation, WITH_OCCLUSION, render=watched, shaded=lambda tape: tape
+        backend,
+        setting,
+        rng,
+        representation,
+        WITH_OCCLUSION,
+        render=render,
+        shaded=lambda tape: tape,
+        further=_sides,
     )
+    return (stage,)
 
-    def function(*args: Floats) -> Point:
-        point = stage.function(*args)
-        return Point(point.outputs, (*point.sides, *sides))
 
-    return (stage._replace(function=function),)
+def _sides(drawn: Drawn) -> list[np.ndarray]:
+    tilts = np.sum(np.tanh(drawn.model.gaussians.normal_textures.reshape(-1, 2)) ** 2, axis=1)
+    return [*cells_of(drawn.tape.blend.shown, TEXELS), tilts < TILT_MAX]
 
 
 def cells_of(shown: Shown, size: int) -> list[np.ndarray]:

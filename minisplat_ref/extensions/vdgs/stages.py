@@ -5,6 +5,7 @@ modes that are not here are parts of those that change both.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,13 +26,11 @@ from minisplat_ref.extensions.vdgs.method import (
 from minisplat_ref.mechanisms.networks.contraction import contract
 from minisplat_ref.mechanisms.networks.mlp import make_network, to_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
-from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
-from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.types import Floats, Model, RenderOutput, View
+from minisplat_ref.types import Floats
 
 HIDDEN, N_LEVELS, N_ROWS = 3, 1, 8  # one coarse level: between many faces, steps are so small that they round
 MODES = (modes.opacity_times, modes.colors_plus, modes.both_times, modes.both_plus)
@@ -55,26 +54,12 @@ def small_shared(modulation: Callable[[], modes.Mode], n_colors: int, rng: np.ra
 def _stage(backend: Backend, setting: Setting, modulation: Callable[[], modes.Mode], rng: np.random.Generator) -> Stage:
     shared = small_shared(modulation, 3 * (1 + setting.gaussians.sh_rest.shape[1]), rng)
     is_first = modulation is MODES[0]
-    recorded: list[tuple[Any, ...]] = []
-
-    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        output, tapes = render(model, view, request, modulation=modulation)
-        assert tapes[1] is not None
-        recorded[:] = [_sides(tapes[1])]
-        return output, tapes
-
     representation = VIEW_DEPENDENT._replace(
         name=VIEW_DEPENDENT.name if is_first else f"{VIEW_DEPENDENT.name}, {modulation.__name__}",
         shared=lambda scene, rng: shared,
-        renderer=VIEW_DEPENDENT.renderer._replace(render=watched),
+        renderer=VIEW_DEPENDENT.renderer._replace(render=partial(render, modulation=modulation)),
     )
-    stage = model_stage(backend, setting, representation, rng)
-
-    def function(*args: Floats) -> Point:
-        point = stage.function(*args)
-        return point._replace(sides=(*point.sides, *recorded[0]))
-
-    return stage._replace(function=function)
+    return model_stage(backend, setting, representation, rng, sides_of=lambda drawn: _sides(drawn.tape[1]))
 
 
 def _sides(tape: Tape) -> tuple[Any, ...]:

@@ -1,6 +1,7 @@
 """Stages of the gradient check for shaded surfels, and on which side of its steps a shaded point is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,12 @@ from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficien
 from minisplat_ref.mechanisms.gbuffer.shading import ShadingTape
 from minisplat_ref.mechanisms.gbuffer.tone import KNEE
 from minisplat_ref.mechanisms.surfels import stages as of_surfels
-from minisplat_ref.oracle.differences import Point
-from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.oracle.models import Drawn, model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
-from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
+from minisplat_ref.types import Floats, RenderOutput, Scene
 
 ROWS = 4  # of the environment: fewer kinks, and fewer derivatives, than training has
 
@@ -54,6 +53,8 @@ def shading_stage(
     *,
     render: Callable[..., tuple[RenderOutput, Any]],
     shaded: Callable[[Any], ReflectiveTape],
+    further: Callable[[Drawn], Sequence[np.ndarray]] = lambda drawn: (),
+    fixed: Sequence[str] = (),
 ) -> Stage:
     """Return a renderer at a stage of shading; what reflected rays see is held at random values.
 
@@ -69,26 +70,23 @@ def shading_stage(
         ``render(model, view, request, visibility)``, that of the representation.
     shaded : callable
         Returns of the renderer's tape that of the shading.
+    further : callable
+        Returns the sides of the representation's own kinks.
+    fixed : sequence of str
+        As for :func:`minisplat_ref.oracle.models.model_stage`.
     """
     visibility = rng.uniform(size=(setting.camera.height, setting.camera.width))
-    sides: list[np.ndarray] = []
 
-    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        output, whole = render(model, view, request, visibility)
-        tape = shaded(whole)
-        sides[:] = [*of_surfels.sides_of(tape.blend.shown), *sides_of(tape.shading, tape.linear)]
-        sides.append(light_around(tape.sight, coefficients(model.gaussians, tape.rows), tape.degree) > 0)
-        return output, whole
+    def sides(drawn: Drawn) -> list[np.ndarray]:
+        tape = shaded(drawn.tape)
+        is_lit = light_around(tape.sight, coefficients(drawn.model.gaussians, tape.rows), tape.degree) > 0
+        own = further(drawn)
+        return [*of_surfels.sides_of(tape.blend.shown), *sides_of(tape.shading, tape.linear), is_lit, *own]
 
     def shared(scene: Scene, rng: np.random.Generator) -> dict[str, Floats]:
         first = dict(representation.shared(scene, rng))
         return {**first, ENVIRONMENT: np.zeros((ROWS, 2 * ROWS, 3)), STAGE: np.full(1, float(stage))}
 
-    renderer = representation.renderer._replace(render=watched)
-    made = model_stage(backend, setting, representation._replace(renderer=renderer, shared=shared), rng)
-
-    def function(*args: Floats) -> Point:
-        point = made.function(*args)
-        return Point(point.outputs, (*point.sides, *sides))
-
-    return made._replace(function=function)
+    renderer = representation.renderer._replace(render=partial(render, visibility=visibility))
+    held = representation._replace(renderer=renderer, shared=shared)
+    return model_stage(backend, setting, held, rng, sides_of=sides, fixed=fixed)

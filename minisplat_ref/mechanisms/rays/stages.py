@@ -6,9 +6,8 @@ import numpy as np
 
 from minisplat_ref.mechanisms.rays.blending import Meeting, list_hits
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
-from minisplat_ref.oracle.differences import Point
-from minisplat_ref.oracle.models import model_stage
-from minisplat_ref.oracle.setting import POSE, Setting
+from minisplat_ref.oracle.models import Drawn, model_stage
+from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
@@ -33,14 +32,11 @@ def trace_stages(
     backend, setting, rng
         As for ``Extension.stages``.
     """
-    stage = model_stage(backend, setting, representation, rng)
 
-    def function(*args: Floats) -> Point:
-        point, named = stage.function(*args), dict(zip(stage.inputs, args, strict=True))
-        R, t = (named[name] for name in POSE)
-        camera = setting.camera._replace(cam_from_world_R=R, cam_from_world_t=t)
-        hits = list_hits(meeting_of(named), pixel_rays(camera, setting.conventions), setting.conventions)
-        is_clamped = hits.unclamped > setting.conventions.alpha_max
-        return Point(point.outputs, (*point.sides, hits.offsets, hits.gaussian_ids, is_clamped))
+    def sides(drawn: Drawn) -> list[np.ndarray]:
+        conventions = setting.conventions
+        meeting = meeting_of(drawn.model.gaussians._asdict())
+        hits = list_hits(meeting, pixel_rays(drawn.view.camera, conventions), conventions)
+        return [hits.offsets, hits.gaussian_ids, hits.unclamped > conventions.alpha_max]
 
-    return (stage._replace(function=function),)
+    return (model_stage(backend, setting, representation, rng, sides_of=sides),)

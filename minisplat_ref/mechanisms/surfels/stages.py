@@ -11,32 +11,19 @@ from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import tile_hits
-from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Floats, Model, Primitives, RenderOutput, View
+from minisplat_ref.types import Floats, Primitives
 
 
 def renderer_stage(
     backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator
 ) -> Stage:
     """Return the renderer with all its channels as a stage whose points record on which side of its steps they are."""
-    sides: list[np.ndarray] = []
-
-    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, object]:
-        asked = request._replace(wants=frozenset(CHANNELS))
-        output, tape = representation.renderer.render(model, view, asked)
-        sides[:] = sides_of(tape.shown)
-        return output, tape
-
-    renderer = representation.renderer._replace(render=watched)
-    stage = model_stage(backend, setting, representation._replace(renderer=renderer), rng)
-
-    def function(*args: Floats) -> Point:
-        point = stage.function(*args)
-        return Point(point.outputs, (*point.sides, *sides))
-
-    return stage._replace(function=function)
+    wants = frozenset(CHANNELS)
+    return model_stage(
+        backend, setting, representation, rng, wants=wants, sides_of=lambda drawn: sides_of(drawn.tape.shown)
+    )
 
 
 def rays_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
