@@ -6,12 +6,14 @@ an evaluation where this is more; 48 bytes for every pair (tile, Gaussian).
 The program, its compiled kernels and the photographs are in memory already and are not counted. Photographs that are
 read on demand, because all together would take too much, count as far as they will stay in memory.
 
-Free memory is read from Linux. Other systems do not publish it in a file; nothing is refused there.
+Free is what psutil says of the system; on Linux less where a container or ``ulimit -v`` leaves less.
 """
 
 import math
 from pathlib import Path
 from typing import NamedTuple
+
+import psutil
 
 from minisplat_ref.errors import InputError
 
@@ -121,14 +123,7 @@ def bytes_to_double(n_rows: int, population_bytes: int, n_pairs: float) -> float
 
 def free_bytes() -> float:
     """Return how many bytes this process can still get from the system, within its limits and its container's."""
-    return RESERVE * min(_of_the_system(), _of_the_control_group(), _of_the_address_space())
-
-
-def _of_the_system() -> float:
-    for line in _lines("/proc/meminfo"):
-        if line.startswith("MemAvailable:"):
-            return 1024.0 * int(line.split()[1])
-    return math.inf
+    return RESERVE * min(psutil.virtual_memory().available, _of_the_control_group(), _of_the_address_space())
 
 
 def _of_the_control_group(root: str = "/sys/fs/cgroup", own: str = "/proc/self/cgroup") -> float:
@@ -153,14 +148,11 @@ _VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 
 def _of_the_address_space() -> float:
     """Return what ``ulimit -v`` leaves."""
-    try:
-        import resource  # absent on Windows
-    except ImportError:
+    if not psutil.LINUX:
         return math.inf
-    limit, pages = resource.getrlimit(resource.RLIMIT_AS)[0], _lines("/proc/self/statm")
-    if limit == resource.RLIM_INFINITY or not pages:
-        return math.inf
-    return limit - resource.getpagesize() * int(pages[0].split()[0])
+    process = psutil.Process()
+    limit, _ = process.rlimit(psutil.RLIMIT_AS)
+    return math.inf if limit == psutil.RLIM_INFINITY else limit - process.memory_info().vms
 
 
 def _lines(path: str) -> list[str]:
@@ -171,7 +163,7 @@ def _lines(path: str) -> list[str]:
 
 
 def check_start(needs: Needs) -> str:
-    """Return a line that says what a training starts with and how far it may grow; empty where free memory is unknown.
+    """Return a line that says what a training starts with and how far it may grow.
 
     The parameters and their moments are in memory already.
 
@@ -181,8 +173,6 @@ def check_start(needs: Needs) -> str:
         It does not fit into memory.
     """
     free, needed, has = free_bytes(), needs.at_the_peak, needs.at_the_peak - needs.to_come
-    if math.isinf(free):
-        return ""
     if needs.to_come > free:
         raise InputError(
             f"training begins with about {as_text(needed)} of memory, {as_text(free + has)} are free: give a larger"

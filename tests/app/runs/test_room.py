@@ -5,6 +5,7 @@ import resource
 import subprocess
 import sys
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -61,6 +62,14 @@ def test_a_limit_to_the_address_space_counts():
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (4 * GIGA, 4 * GIGA)),
     )
     assert 0 < float(done.stdout) < 4 * GIGA
+
+
+def test_elsewhere_than_on_linux_free_is_what_the_system_says(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory.psutil, "LINUX", False)
+    monkeypatch.delattr(memory.psutil.Process, "rlimit")
+    monkeypatch.setattr(memory, "Path", lambda *_: tmp_path / "no such file")  # neither /proc nor /sys
+    monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: SimpleNamespace(available=100.0))
+    assert memory.free_bytes() == 95.0
 
 
 # what fits
