@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 
 from data_tools.fuzz.judging import SECONDS_MAX, Verdict, judge
 from data_tools.fuzz.mutations import Choose
@@ -154,15 +155,10 @@ def _work(
 
 def _limit_memory() -> None:
     """Limit the address space of this process, where the system can."""
-    try:
-        import resource  # absent on Windows
-    except ImportError:
-        return
-    status = Path("/proc/self/status")
-    if status.exists():
-        (line,) = [line for line in status.read_text().splitlines() if line.startswith("VmSize")]
-        limit = 1024 * int(line.split()[1]) + ADDRESS_SPACE
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    if psutil.LINUX:
+        process = psutil.Process()
+        limit = process.memory_info().vms + ADDRESS_SPACE
+        process.rlimit(psutil.RLIMIT_AS, (limit, limit))
 
 
 def keep(reader: Reader, seed: int, number: int, out: Path) -> Mutant:
