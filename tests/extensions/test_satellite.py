@@ -63,6 +63,16 @@ def test_northings_are_arcs_of_the_meridian(latitude):
     assert np.abs(found - [500_000, 0.9996 * arc]).max() < 1e-6
 
 
+@pytest.mark.parametrize("is_south", [False, True])
+def test_utm_agrees_with_proj(is_south):
+    """All over a zone and half a degree beyond, to a micrometre; what rasterio calls."""
+    warp = pytest.importorskip("rasterio.warp")
+    rng, code = np.random.default_rng(0), f"EPSG:{32732 if is_south else 32632}"
+    longitudes, latitudes = rng.uniform(5.5, 12.5, 1000), rng.uniform(0, 84, 1000) * (-1 if is_south else 1)
+    found = utm.utm_from_degrees(longitudes, latitudes, 32, is_south=is_south)
+    assert np.abs(found - np.column_stack(warp.transform("EPSG:4326", code, longitudes, latitudes))).max() < 1e-6
+
+
 def make_rpc(curved=0.0):
     """An RPC over 600 m in Rome, 0.5 m pixels, which a height shifts; ``curved`` adds cubics and a denominator."""
     numerators, denominators = np.zeros((2, 20)), np.zeros((2, 20))
