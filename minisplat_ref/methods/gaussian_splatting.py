@@ -28,7 +28,7 @@ def collect_gradients(state: TrainState, iteration: Iteration) -> None:
     Gaussian is still rendered; gradients are multiplied by it, so that their mean, like the threshold, refers to all
     views.
     """
-    n = n_rows(state.layout)
+    n = n_rows(state.gaussians)
     if "gradient_sum" not in state.stats:
         state.stats["gradient_sum"] = np.zeros(n, iteration.v_means2d.dtype)
         state.stats["view_count"] = np.zeros(n, np.int32)
@@ -128,7 +128,7 @@ GS = Recipe(
     losses=(LossTerm("photometric", partial(photometric, dssim_weight=0.2), weight=1.0),),
     has_random_background=False,
     events=(
-        During(collect_gradients, stop=15_000),
+        During(collect_gradients, stop=15_000, reads_parameters=False),
         _densifying(partial(clone_and_split, threshold=2e-4, size_fraction=0.01), start=500),
         _densifying(partial(prune_faint, min_opacity=0.005), start=500),
         _densifying(partial(prune_large, size_fraction=0.1), start=3_000),

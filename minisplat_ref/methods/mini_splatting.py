@@ -281,9 +281,10 @@ _reinitialise = partial(
     backdrop_extents=BACKDROP_EXTENTS,
     largest_size=LARGE,
 )
+_collecting = partial(During, stop=15_000, reads_parameters=False)
 _DENSIFICATION = (
-    During(collect_gradients, stop=15_000),
-    During(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), stop=15_000, wants=BLEND_STATS),
+    _collecting(collect_gradients),
+    _collecting(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), wants=BLEND_STATS),
     _densifying(_densify, start=500),
     _densifying(partial(prune_faint, min_opacity=0.005), start=500),
     _densifying(partial(prune_large_by_distance, size_fraction=LARGE), start=3_000),

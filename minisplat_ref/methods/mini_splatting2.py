@@ -119,11 +119,12 @@ _reinitialise = partial(
     largest_size=LARGE,
 )
 _densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, min_gap=DENSIFY_LEAST_GAP)
+_collecting = partial(During, stop=3_000, reads_parameters=False)
 
 _DENSIFICATION = (
     SmallerViews(partial(halve_large_views, min_side=HALF_SIDE_MIN, max_halvings=1), until=3_000),
-    During(collect_gradients, stop=3_000),
-    During(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), stop=3_000, wants=BLEND_STATS),
+    _collecting(collect_gradients),
+    _collecting(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), wants=BLEND_STATS),
     _densifying(_densify),
     _densifying(partial(prune_faint, min_opacity=0.005)),
     At(2_000, _reinitialise),

@@ -33,7 +33,7 @@ class Case(NamedTuple):
     @property
     def terms(self) -> Sequence[LossTerm]:
         """Return the loss terms that are due."""
-        return [term for term in self.recipe.losses if term.is_due(self.step)]
+        return self.recipe.due_terms(self.step)
 
 
 def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -> None:

@@ -1,11 +1,14 @@
 """The training loop: iterations until the recipe ends.
 
-What happens in one of them is in :mod:`minisplat_ref.training.iteration`.
+What happens in one of them is in :mod:`minisplat_ref.training.iteration`, or, on a GPU, in its twin
+:mod:`minisplat_ref.training.on_device`: which of the two pages is chosen once, by the backend.
 """
 
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
+from typing import Any
 
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputWarning, one_line
@@ -13,13 +16,13 @@ from minisplat_ref.io.frames import choose_frame
 from minisplat_ref.io.stored_views import ReadingAhead
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import CPU, Backend
-from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.training import iteration
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.initial_state import check_fits, initial_state
 from minisplat_ref.training.interruption import Interruptions
-from minisplat_ref.training.iteration import Surroundings, iterate
+from minisplat_ref.training.iteration import Training
+from minisplat_ref.training.on_device import on_device
 from minisplat_ref.training.pace import COOLED, Decision
-from minisplat_ref.training.resident import Residence, residing
 from minisplat_ref.training.schedule import Recipe, as_decided
 from minisplat_ref.training.smaller_views import ViewSizes
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
@@ -76,16 +79,23 @@ def train(
     _warn_of_frame(scene)
     check_fits(state, scene, as_decided(recipe, state.pace))
     sizes, switched_on = ViewSizes(recipe, scene), None
-    residence = None if backend.residence is None else Residence(backend)
-    with ReadingAhead() as ahead, Interruptions() as interruptions, residing(residence, state):
+    page: Any = nullcontext(iteration) if backend.residence is None else on_device(backend, state)
+    with ReadingAhead() as ahead, Interruptions() as interruptions, page as page:
         while state.step < last_step(state, recipe):
             _cool_in_time(state, recipe)
             if state.pace.switched_on != switched_on:
                 switched_on, decided = state.pace.switched_on, as_decided(recipe, state.pace)
                 settings = RenderSettings(scene.background, conventions, backend, decided.renderer)
             n_halvings = sizes.count_halvings(state.step + 1, state.pace)
-            around = Surroundings(decided, sizes.halve(n_halvings), n_halvings, settings, guard, ahead, residence)
-            report = _complete(iterate(state, around, interruptions), recipe, sizes)
+            halved = sizes.halve(n_halvings)
+            training = Training(decided, halved, n_halvings, settings, guard, ahead, interruptions, page.fetch)
+            report = page.iterate(state, training)
+            is_open = recipe.cooling is not None and state.pace.last_step is None
+            report = report._replace(
+                last_step=None if is_open else last_step(state, recipe),
+                n_halvings=sizes.count_halvings(state.step + 1, state.pace),
+                fired=(*sizes.record_start(state.step, report.n_gaussians), *report.fired),
+            )
             if on_step is not None:
                 on_step(report)
             del report  # frees its image before the next is made
@@ -102,17 +112,6 @@ def _warn_of_frame(scene: Scene) -> None:
             " for which neither float32 nor the near plane is made: train io.frames.place_scene(scene)"
         )
         warnings.warn(one_line(message), InputWarning, stacklevel=3)
-
-
-def _complete(report: StepReport, recipe: Recipe, sizes: ViewSizes) -> StepReport:
-    """Return the report of an iteration with what the loop knows: where the training ends, and the views' sizes."""
-    state = report.state
-    is_open = recipe.cooling is not None and state.pace.last_step is None
-    return report._replace(
-        last_step=None if is_open else last_step(state, recipe),
-        n_halvings=sizes.count_halvings(state.step + 1, state.pace),
-        fired=(*sizes.record_start(state.step, n_rows(state.layout)), *report.fired),
-    )
 
 
 def last_step(state: TrainState, recipe: Recipe, iterations: int | None = None) -> int:

@@ -42,6 +42,9 @@ class During(NamedTuple):
     stop: int | None = None
     wants: frozenset[str] = frozenset()
     """What to render in these iterations for the action; see :class:`minisplat_ref.rendering.Request`."""
+    reads_parameters: bool = True
+    """Whether the action reads or changes parameters or moments, for which a GPU copies all of them in each of these
+    iterations. If it seldom does, it may say False and call ``iteration.fetch()`` before."""
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
@@ -189,6 +192,32 @@ class Recipe(NamedTuple):
         """Return all learning rates: the recipe's, the representation's, the calibrations'."""
         rates = self.learning_rates.join(self.representation.rates)
         return functools.reduce(Rates.join, (calibration.rates for calibration in self.active_calibrations), rates)
+
+    def rates_at(self, step: int, extent: float, pace: Pace) -> dict[str, float]:
+        """Return the learning rates of an iteration in a scene of this extent; they fall during a cool-down."""
+        rates = self.rates
+        values = rates.at(step, extent)
+        if self.cooling is None or pace.cooling_from is None:
+            return values
+        factor, factor_per_extent = self.cooling.factors(step, pace)
+        return {name: v * (factor_per_extent if name in rates.per_extent else factor) for name, v in values.items()}
+
+    def due_terms(self, step: int) -> list[LossTerm]:
+        """Return the terms of an iteration's loss."""
+        return [term for term in self.losses if term.is_due(step)]
+
+    def due_events(self, step: int) -> list["During | DatedEvent"]:
+        """Return the events that act in an iteration, in their order."""
+        return [event for event in self.events if isinstance(event, During | DatedEvent) and event.is_due(step)]
+
+    def may_edit(self, step: int) -> bool:
+        """Return whether an event of an iteration may add or remove rows."""
+        return any(isinstance(event, DatedEvent) for event in self.due_events(step))
+
+    def wants(self, step: int) -> frozenset[str]:
+        """Return what terms and events of an iteration want rendered."""
+        collecting = [event.wants for event in self.due_events(step) if isinstance(event, During)]
+        return frozenset().union(*(term.wants for term in self.due_terms(step)), *collecting)
 
 
 def does(event: Event, *actions: Callable[..., Any]) -> bool:
@@ -482,7 +511,7 @@ def action_name(event: Event) -> str:
 def _describe_event(event: Event) -> dict[str, Any]:
     return {
         "event": type(event).__name__,
-        **_describe_fields(event._asdict()),
+        **_describe_fields({name: value for name, value in event._asdict().items() if name != "reads_parameters"}),
         **_describe_function(event.action, "action"),
     }
 

@@ -54,21 +54,6 @@ class TrainState:
     frame: Frame = FILE_FRAME
     """That of the scene, in which the parameters are."""
 
-    resident: Any = None
-    """A :class:`~minisplat_ref.training.resident.Residence` while it has the newest parameters and moments."""
-
-    def __getattr__(self, name: str) -> Any:
-        """Return ``gaussians`` or ``adam`` from the device, where they are while neither is an attribute here."""
-        if name in ("gaussians", "adam") and self.__dict__.get("resident") is not None:
-            self.resident.bring_back(self)
-            return self.__dict__[name]
-        raise AttributeError(f"{type(self).__name__} has no attribute {name}")
-
-    @property
-    def layout(self) -> Any:
-        """Return the population wherever its arrays are, for their shapes: nothing is copied from a device."""
-        return self.__dict__["gaussians"] if "gaussians" in self.__dict__ else self.resident.gaussians
-
     @property
     def model(self) -> Model:
         """Return the parameters, as the renderer takes them."""
@@ -108,6 +93,9 @@ class Iteration(NamedTuple):
     """How often the views were halved in width and height."""
     say: Callable[[str], None] = unheard
     """Tells the user something in one line, at once; a note for the record alone is returned instead."""
+    fetch: Callable[[], Any] = lambda: None
+    """Copies parameters and moments into the state, where a GPU has newer ones. Only actions whose event does not read
+    parameters (:attr:`During.reads_parameters <minisplat_ref.training.schedule.During>`) need it."""
 
 
 class FiredEvent(NamedTuple):
@@ -135,8 +123,11 @@ class StepReport(NamedTuple):
     view: View
     output: RenderOutput
     """The rendering that ``loss`` measures, float32, not clipped."""
-    state: TrainState
-    """The state after the iteration; it is safe to save."""
+    n_gaussians: int
+    n_bytes: int
+    """Of their parameters."""
+    fetch: Callable[[], TrainState]
+    """Copies parameters and moments into the state, where a GPU has newer ones, and returns it."""
     last_step: int | None = None
     """Iteration at which the training ends; None while a recipe that decides this has not done so."""
     n_halvings: int = 0
@@ -145,6 +136,11 @@ class StepReport(NamedTuple):
     """Events that acted after the gradient step, in their order."""
     notes: tuple[str, ...] = ()
     """Messages to the user, one line each."""
+
+    @property
+    def state(self) -> TrainState:
+        """Return the state after the iteration, fetched; it is safe to save."""
+        return self.fetch()
 
 
 def n_pixels(scene: Scene) -> int:

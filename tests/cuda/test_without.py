@@ -11,10 +11,12 @@ import pytest
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.tile_state import lists_of
 from minisplat_ref.errors import InputError
+from minisplat_ref.methods.gaussian_splatting import GS
 from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.resident import Residence
+from minisplat_ref.training.case import Case
+from minisplat_ref.training.on_device import OnDevice
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import TileGrid, View
 from scenes import activated, as_dtype, make_camera, make_gaussians
@@ -125,7 +127,8 @@ def test_a_training_that_does_not_fit_is_refused_before_anything_is_copied():
     view = View("view", make_camera(40, 30), np.zeros((30, 40, 3), np.uint8), None)
     device = SimpleNamespace(free_bytes=lambda: 1_000.0)  # a call of anything else is an error
     state = TrainState(g, zero_moments(g), 0, [], np.random.default_rng(0), {})
-    residence = Residence(SimpleNamespace(name="cuda", residence=device))
+    case = Case(1, state.model, view, None, Request(), GS)
+    engine = OnDevice(SimpleNamespace(name="cuda", residence=device))
     with pytest.raises(InputError, match=r"no memory for 50 Gaussians in 40 x 30 pixels: some 0\.00 GB are needed"):
-        residence.differentiate(state, view, Request(), None)
+        engine.differentiate(state, case)
     assert state.gaussians is g

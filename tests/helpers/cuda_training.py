@@ -24,10 +24,25 @@ from scenes import as_dtype, make_camera, make_gaussians
 
 N_GAUSSIANS = 6
 EVENTS = (
-    During(gaussian_splatting.collect_gradients),
-    During(partial(mini_splatting.collect_blur, area_fraction=0.01), wants=BLEND_STATS),
+    During(gaussian_splatting.collect_gradients, reads_parameters=False),
+    During(partial(mini_splatting.collect_blur, area_fraction=0.01), wants=BLEND_STATS, reads_parameters=False),
     At(2, partial(gaussian_splatting.clone_and_split, threshold=0.0, size_fraction=0.15)),
 )
+
+
+def move(state, iteration):
+    """Read a parameter, and change it."""
+    state.gaussians.means[0] += state.gaussians.means[1]
+
+
+def move_seldom(state, iteration):
+    """Do it in the second iteration only."""
+    if iteration.step == 2:
+        iteration.fetch()
+        move(state, iteration)
+
+
+MOVES = During(move, stop=2), During(move_seldom, reads_parameters=False)
 
 
 def recipe_of(name, iterations, events=()):
@@ -37,6 +52,7 @@ def recipe_of(name, iterations, events=()):
 TRAININGS = {
     "events": recipe_of("3dgs-accel", 3, EVENTS),  # only the rows that a view sees
     "dense": recipe_of("3dgs", 1),
+    "moved": recipe_of("3dgs-accel", 3, MOVES),
 }
 
 
@@ -90,7 +106,7 @@ def count_copies(scene, backend):
         return to_host(self, *args, **named)
 
     def on_step(report):
-        steps.append((dict(copied), report.state.layout is report.state.resident.gaussians))
+        steps.append(dict(copied))
         copied.update({"to": [], "from": []})
 
     def no_array(self, *args, **named):

@@ -47,9 +47,8 @@ def _may_burst(report: StepReport, recipe: Recipe) -> bool:
     """Return whether rows may be added in the next iteration, and there is no room for twice as many."""
     if not any(isinstance(event, DatedEvent) and event.is_due(report.step + 1) for event in recipe.events):
         return False
-    gaussians = report.state.layout
-    n, n_bytes = len(gaussians.means), sum(field.nbytes for field in gaussians)
-    return memory.rows_that_fit(n, n_bytes, report.output.n_pairs, memory.free_bytes()) < 2 * n
+    n = report.n_gaussians
+    return memory.rows_that_fit(n, report.n_bytes, report.output.n_pairs, memory.free_bytes()) < 2 * n
 
 
 def newest(folder: Path, read: Callable[[Path], Content]) -> Content:

@@ -107,8 +107,6 @@ class Progress(AbstractContextManager["Progress"]):
         view_psnr = psnr(image, report.view.image, report.view.mask)
         self._psnrs.append(min(view_psnr, PSNR_MAX))
         loss, mean_psnr = float(np.mean(self._losses)), float(np.mean(self._psnrs))
-        gaussians = report.state.layout
-        n_gaussians = len(gaussians.means)
         seconds, cpu_seconds = self.clock
         append_log(
             self._log_path,
@@ -116,14 +114,14 @@ class Progress(AbstractContextManager["Progress"]):
                 "step": report.step,
                 "loss": loss,
                 "psnr": mean_psnr,
-                "n_gaussians": n_gaussians,
-                "model_mb": sum(field.nbytes for field in gaussians) / 1e6,
+                "n_gaussians": report.n_gaussians,
+                "model_mb": report.n_bytes / 1e6,
                 "seconds": seconds,
                 "cpu_seconds": cpu_seconds,
                 "its/s": report.step / seconds,
             },
         )
-        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians{self._min_rest(report)}"
+        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {report.n_gaussians:,} Gaussians{self._min_rest(report)}"
         self._bar.set_postfix_str(line, refresh=False)
         self._losses.clear()
 

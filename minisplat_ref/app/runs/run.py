@@ -143,7 +143,7 @@ def _train(
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
     callbacks.extend(watch(folder, scene, settings, progress) for watch in watches)
     if settings.minutes is not None:
-        callbacks.append(_in_time(settings, recipe, progress, len(scene.train_views)))
+        callbacks.append(_in_time(settings, recipe, state, progress, len(scene.train_views)))
     callbacks.append(checkpoints.save_regularly(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
@@ -165,7 +165,9 @@ def _train(
         return progress.clock
 
 
-def _in_time(settings: Settings, recipe: Recipe, progress: Progress, n_views: int) -> Callable[[StepReport], None]:
+def _in_time(
+    settings: Settings, recipe: Recipe, state: TrainState, progress: Progress, n_views: int
+) -> Callable[[StepReport], None]:
     """Return a callback of the loop that begins the cool-down in time to end after ``settings.minutes``.
 
     Halved views are left behind before that, because the cool-down shows the photographs as they are: when it would not
@@ -179,7 +181,6 @@ def _in_time(settings: Settings, recipe: Recipe, progress: Progress, n_views: in
     def on_step(report: StepReport) -> None:
         clock.append(progress.seconds)
         left = 60 * minutes - clock[-1]
-        state = report.state
         if state.pace.cooling_from is not None or len(clock) < 2:
             return
         length = math.ceil(cooling.part * report.step)

@@ -72,16 +72,17 @@ def raise_degrees(state: TrainState, iteration: Iteration, *, views_per_coeffici
     views_per_coefficient : float
         Training views that a Gaussian must have been seen in for each coefficient of a channel of its colour.
     """
-    n, n_views = n_rows(state.layout), len(iteration.scene.train_views)
+    n, n_views = n_rows(state.gaussians), len(iteration.scene.train_views)
     if state.pace.cooling_from is not None:
         return
     if DEGREES not in state.stats:
+        iteration.fetch()
         state.stats |= {DEGREES: present_degrees(state.gaussians.sh_rest), SEEN: np.zeros((n, n_views), bool)}
     is_seen, view = state.stats[SEEN], iteration.view.view_id
     ids = iteration.visible_ids[iteration.v_means2d[iteration.visible_ids].any(axis=1)]  # those in front of others
     ids = ids[~is_seen[ids, view]]
     is_seen[ids, view] = True
-    stored = round((state.layout.sh_rest.shape[1] + 1) ** 0.5) - 1
+    stored = round((state.gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
     determined = highest_degree(is_seen[ids].sum(axis=1), views_per_coefficient, stored)
     state.stats[DEGREES][ids] = np.maximum(state.stats[DEGREES][ids], determined)
 
@@ -98,6 +99,7 @@ def cut_degrees_when_cooling(state: TrainState, iteration: Iteration, *, min_var
     """
     if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
         return
+    iteration.fetch()
     degrees, is_seen = state.stats[DEGREES], state.stats.pop(SEEN)
     state.gaussians, state.stats[DEGREES] = without_idle_degrees(
         state.gaussians, degrees, iteration.scene.train_views, is_seen, min_variation

@@ -71,6 +71,7 @@ def prune_in_slices(
         if is_over(state.pace, iteration.step):
             take_all_views(state, iteration)
         return
+    iteration.fetch()
     now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
     state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
     psnr_cost, ssim_cost = foreseen_costs(state.pace.before_slices)

@@ -24,6 +24,7 @@ from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import At, During, Every, SmallerViews
 from minisplat_ref.training.smaller_views import halve_large_views
 
+_always = partial(During, reads_parameters=False)  # those that seldom do call iteration.fetch()
 _regularly = partial(Every, numbers.PERIOD, start=numbers.PERIOD)  # not in the first of these iterations
 
 ADAPTIVE = GS._replace(
@@ -39,10 +40,10 @@ ADAPTIVE = GS._replace(
             partial(halve_large_views, min_side=numbers.VIEW_SIDE_MIN),
             start=numbers.WHOLE_VIEWS_UNTIL,
         ),
-        During(collect_while_growing),
-        During(partial(raise_degrees, views_per_coefficient=numbers.VIEWS_PER_COEFFICIENT)),
-        During(hold_mean_exposure),
-        During(hold_mean_pose),
+        _always(collect_while_growing),
+        _always(partial(raise_degrees, views_per_coefficient=numbers.VIEWS_PER_COEFFICIENT)),
+        _always(hold_mean_exposure),
+        _always(hold_mean_pose),
         At(numbers.SKY_STEP, partial(switch_sky_on, min_sky_gain=numbers.SKY_GAIN_MIN)),
         At(
             numbers.EXPOSURE_STEP,
@@ -74,7 +75,7 @@ ADAPTIVE = GS._replace(
                 start=numbers.VEIL_START,
             )
         ),
-        During(
+        _always(
             partial(
                 prune_in_slices,
                 min_views=numbers.SEEN_BY_MIN,
@@ -84,7 +85,7 @@ ADAPTIVE = GS._replace(
                 max_ssim_cost=numbers.SSIM_COST_MAX,
             )
         ),
-        During(partial(cut_degrees_when_cooling, min_variation=numbers.VARIATION_MIN)),
+        _always(partial(cut_degrees_when_cooling, min_variation=numbers.VARIATION_MIN)),
     ),
     min_views=numbers.TRAIN_VIEWS_MIN,
     starts_densely=True,

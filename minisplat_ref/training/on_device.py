@@ -1,17 +1,23 @@
-"""A training whose parameters, moments, photographs and gradients stay on a device through render, loss and Adam.
+"""The twin of :mod:`minisplat_ref.training.iteration` for arrays that stay on a device through render, loss and Adam.
 
-The loop and the events are those of every training. While a :class:`Residence` has the newest parameters, the state has
-none: the first use of ``state.gaussians`` or ``state.adam`` copies them back, and after that the state's are the
-newest, which the next iteration copies to the device. So whoever looks, an event, a checkpoint, a user's callback, sees
-what is true and may change it, and an iteration in which nobody looks copies no parameter.
+Parameters, moments, photographs and gradients stay there, and the loop and the events are those of every training. An
+:class:`OnDevice` copies its parameters and moments into the state at these places, and nowhere else:
+
+- before events that read parameters: all dated ones, and those of every iteration that do not deny it;
+- when an action or a callback calls ``fetch``, which ``report.state`` does;
+- where a number is not finite, for the check that names it;
+- before an iteration that has no kernels, and at the end of the training.
+
+Until then the arrays of the state are older, of the same shapes. From then on they count, and the next iteration copies
+them to the device: whoever fetches them may change them.
 
 What runs here is plain 3DGS: its renderer, one photometric term, no shared parameters. Everything else that a recipe
-may have (another renderer, further terms, calibrations) is computed with arrays on the host, by the same stages.
+may have (another renderer, further terms, calibrations) is computed with arrays in memory, by the same stages.
 """
 
-import contextlib
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,17 +26,33 @@ import numpy as np
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, RenderGradient, Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.rendering.splatting import splat
-from minisplat_ref.training.adam import AdamRule, AdamState, adam_step
+from minisplat_ref.training import iteration
+from minisplat_ref.training.adam import AdamState, adam_step
 from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
+from minisplat_ref.training.iteration import Stepped, Training, draw_case, due_events, run_events, undrawn_on_error
 from minisplat_ref.training.losses import Loss, LossTerm, photometric
 from minisplat_ref.training.rates import n_coefficients
-from minisplat_ref.training.schedule import BLEND_STATS
-from minisplat_ref.training.state import DEGREES, TrainState
-from minisplat_ref.types import Floats, Gaussians, Ints, ProjectionGradient, RenderOutput, View
+from minisplat_ref.training.schedule import BLEND_STATS, DatedEvent, Recipe
+from minisplat_ref.training.state import DEGREES, StepReport, TrainState
+from minisplat_ref.types import NOTHING, Floats, Gaussians, Ints, ProjectionGradient, RenderOutput, View
 
 PHOTOGRAPHS_SHARE = 0.25  # of the free memory of the device, for photographs that stay there
+
+NOBODY: Ints = np.empty(0, np.int64)  # rows
+
+
+@contextmanager
+def on_device(backend: Backend, state: TrainState) -> Iterator["OnDevice"]:
+    """Return the iterations of a training on a device; copy its arrays into the state in the end, whatever happens."""
+    engine = OnDevice(backend)
+    try:
+        yield engine
+    finally:
+        engine.fetch(state)
+        engine.gaussians = engine.adam = None
 
 
 class Differentiated(NamedTuple):
@@ -44,59 +66,55 @@ class Differentiated(NamedTuple):
     radii: Ints  # [N, 2]
 
 
-@contextlib.contextmanager
-def residing(residence: "Residence | None", state: TrainState) -> Iterator[None]:
-    """Copy parameters and moments back to the state in the end, whatever happened."""
-    try:
-        yield
-    finally:
-        if residence is not None:
-            residence.leave(state)
-
-
-class Residence:
-    """The arrays of a training on a device."""
+class OnDevice:
+    """The arrays of a training on a device, and its iterations."""
 
     def __init__(self, backend: Any) -> None:
         self.backend, self.device = backend, backend.residence
         self.gaussians: Any = None
         self.adam: Any = None
+        self.is_newer = False
+        """Whether these are newer than those of the state."""
         self._photographs: dict[tuple[str, tuple[int, ...]], Any] = {}
         self._room = PHOTOGRAPHS_SHARE * self.device.free_bytes()
         self._nothing: Any = None  # [H, W] zeros
         self._said: set[str] = set()
-        self._notes: list[str] = []
 
-    def stays_here(self, state: TrainState, request: Request, recipe: Any, terms: list[LossTerm]) -> bool:
-        """Return whether an iteration can stay on the device; if it cannot, note once why."""
-        why = self.why_not(state, request, recipe, terms)
-        if why is not None and why not in self._said:
-            self._said.add(why)
-            self._notes.append(
-                f"backend {self.backend.name}: {why} has no kernels for the GPU; arrays stay on the host, and stages"
-                " that have kernels copy them"
-            )
-        return why is None
+    def iterate(self, state: TrainState, training: Training) -> StepReport:
+        """Do one iteration; an error before the step leaves the state as if the iteration had not begun."""
+        guard, step = training.guard, state.step + 1
+        if why := why_not(state, training.recipe, step):
+            report = iteration.iterate(self.fetch(state), training)
+            return report._replace(notes=(*self._say_once(why), *report.notes))
+        with undrawn_on_error(state):
+            case = draw_case(state, training)
+            found = self.differentiate(state, case)
+            wrong = self.wrong_in(state, case, found, guard)
+            training.interruptions.defer()
+        state.is_whole = False
+        if wrong is None:
+            self.take_step(state, case, found)
+        if (guard.is_due(step) or case.recipe.may_edit(step)) and self.has_wrong():
+            guard.check_parameters(case._replace(model=self.fetch(state).model), "Adam")
+        due, visible_ids, v_means2d = due_events(case, wrong), NOBODY, found.v_means2d
+        if due:
+            visible_ids = np.flatnonzero(self.device.to_host(found.radii)[:, 0] > 0)
+            v_means2d = self.device.to_host(v_means2d)
+        if any(isinstance(event, DatedEvent) or event.reads_parameters for event in due):
+            self.fetch(state)
+        return run_events(state, training, Stepped(case, found.loss, found.output, visible_ids, v_means2d, wrong))
 
-    def take_notes(self) -> list[str]:
-        """Return what is to be said, once."""
-        notes, self._notes = self._notes, []
-        return notes
+    def fetch(self, state: TrainState) -> TrainState:
+        """Copy parameters and moments into the state, and return it."""
+        if self.is_newer:
+            state.gaussians, first, second = map(self.device.to_host, (self.gaussians, *self.adam[:2]))
+            state.adam = AdamState(first, second, self.adam.step, self.adam.joined)
+            self.is_newer = False
+        return state
 
-    def why_not(self, state: TrainState, request: Request, recipe: Any, terms: list[LossTerm]) -> str | None:
-        """Return what of an iteration has no kernels for the device, None if all of it can stay there."""
-        if recipe.renderer is not SPLATTING or type(state.layout) is not Gaussians:
-            return f"the renderer {recipe.renderer.name}"
-        if state.shared:
-            return f"the shared parameters {', '.join(state.shared)}"
-        others = [term.name for term in terms if not _is_photometric(term)]
-        if others or len(terms) != 1:
-            return f"the loss {', '.join(others) or 'of ' + str(len(terms)) + ' terms'}"
-        further = request.wants - BLEND_STATS
-        return f"the channel {', '.join(sorted(further))}" if further else None
-
-    def differentiate(self, state: TrainState, view: View, request: Request, term: LossTerm) -> Differentiated:
+    def differentiate(self, state: TrainState, case: Case) -> Differentiated:
         """Render a view, compare it with its photograph, and chain the gradient to the parameters."""
+        view, request, (term,) = case.view, case.request, case.terms
         self._take(state, view)
         g, backend, camera, conventions = self.gaussians, self.backend, view.camera, request.conventions
         degree, dtype = _degree(request, g.sh_rest), g.means.dtype
@@ -124,24 +142,26 @@ class Residence:
         output = splats.output._replace(n_pairs=len(splats.bins.gaussian_ids))
         return Differentiated(output, loss, gradient, v_image, v.means2d, projection.radii)
 
-    def wrong_in(self, found: Differentiated, state: TrainState, case: Case, guard: Guard) -> Wrong | None:
+    def wrong_in(self, state: TrainState, case: Case, found: Differentiated, guard: Guard) -> Wrong | None:
         """Check the loss, and the numbers when they are due; see :meth:`~minisplat_ref.training.guard.Guard.wrong_in`.
 
         Only where something is wrong are the arrays copied back, for the check that names it.
         """
         if math.isfinite(found.loss) and not (guard.is_due(case.step) and self.has_wrong(found.gradient)):
             return None
-        host = self.device.to_host(found)
+        there = self.device.to_host(found)
         nothing: Any = np.zeros(0)
-        gradient = RenderGradient(host.gradient, nothing, nothing, nothing, host.v_means2d)
-        return guard.wrong_in(case._replace(model=state.model), Loss(found.loss, host.v_image, None, {}, {}), gradient)
+        gradient = RenderGradient(there.gradient, nothing, nothing, nothing, there.v_means2d)
+        loss = Loss(found.loss, there.v_image, None, NOTHING, NOTHING)
+        return guard.wrong_in(case._replace(model=self.fetch(state).model), loss, gradient)
 
     def has_wrong(self, *bundles: Any) -> bool:
         """Return whether a parameter, or a number of further bundles, is not finite."""
         return self.device.has_wrong(self.gaussians, *bundles)
 
-    def step(self, state: TrainState, rates: Any, rule: AdamRule, found: Differentiated) -> None:
+    def take_step(self, state: TrainState, case: Case, found: Differentiated) -> None:
         """Move all parameters by one step of Adam."""
+        rule, rates = case.recipe.adam, case.recipe.rates_at(case.step, case.scene.extent, state.pace)
         limits = 3 * n_coefficients(state.stats[DEGREES]).astype(np.int32) if DEGREES in state.stats else None
         widths = {}
         if rule.is_visible_only:
@@ -151,33 +171,13 @@ class Residence:
         elif limits is not None:
             widths = {"sh_rest": self.device.to_device(limits)}
         dense: Any = rule._replace(is_visible_only=False)  # the widths say which rows are seen
-        nobody = np.empty(0, np.int64)
         parameters = self.gaussians, found.gradient, self.adam
-        self.adam = adam_step(*parameters, rates, dense, nobody, self.backend, widths=widths)
-        for name in ("gaussians", "adam"):
-            state.__dict__.pop(name, None)
-        state.resident = self
-
-    def what_events_need(self, found: Differentiated) -> tuple[Ints, Floats]:
-        """Return the visible rows [V] and the gradient with respect to the projected centres [N, 2], on the host."""
-        return np.flatnonzero(self.device.to_host(found.radii)[:, 0] > 0), self.device.to_host(found.v_means2d)
-
-    def bring_back(self, state: TrainState) -> None:
-        """Copy parameters and moments to the state, whose they are from now on."""
-        state.gaussians = self.device.to_host(self.gaussians)
-        moments = self.device.to_host(self.adam.first), self.device.to_host(self.adam.second)
-        state.adam = AdamState(*moments, self.adam.step, self.adam.joined)
-
-    def leave(self, state: TrainState) -> None:
-        """Copy what the state does not have yet, and forget it here."""
-        if state.resident is not None:
-            _ = state.gaussians
-            state.resident = None
-        self.gaussians = self.adam = None
+        self.adam = adam_step(*parameters, rates, dense, NOBODY, self.backend, widths=widths)
+        self.is_newer = True
 
     def _take(self, state: TrainState, view: View) -> None:
-        """Copy parameters and moments to the device if the state has them."""
-        if "gaussians" not in state.__dict__:
+        """Copy parameters and moments to the device, unless it has the newest."""
+        if self.is_newer:
             return
         self.gaussians = self.adam = None  # frees their memory first
         camera, g = view.camera, state.gaussians
@@ -206,6 +206,14 @@ class Residence:
             self._photographs[key] = both
         return self._photographs[key]
 
+    def _say_once(self, why: str) -> list[str]:
+        """Return a note of why arrays are in memory, unless it was said before."""
+        if why in self._said:
+            return []
+        self._said.add(why)
+        stay = "arrays stay on the host, and stages that have kernels copy them"
+        return [f"backend {self.backend.name}: {why} has no kernels for the GPU; {stay}"]
+
     def _zeros(self, like: Any) -> Any:
         """Return zeros of the shape and dtype of alpha."""
         if self._nothing is None or (self._nothing.shape, self._nothing.dtype) != (like.shape, like.dtype):
@@ -214,6 +222,20 @@ class Residence:
 
     def _depth_zeros(self, n: int, dtype: Any) -> Any:
         return self.device.zeros((n, 1), dtype).reshape(n)
+
+
+def why_not(state: TrainState, recipe: Recipe, step: int) -> str | None:
+    """Return what of an iteration has no kernels for the device, None if all of it can stay there."""
+    if recipe.renderer is not SPLATTING or type(state.gaussians) is not Gaussians:
+        return f"the renderer {recipe.renderer.name}"
+    if state.shared:
+        return f"the shared parameters {', '.join(state.shared)}"
+    terms = recipe.due_terms(step)
+    others = [term.name for term in terms if not _is_photometric(term)]
+    if others or len(terms) != 1:
+        return f"the loss {', '.join(others) or 'of ' + str(len(terms)) + ' terms'}"
+    further = recipe.wants(step) - BLEND_STATS
+    return f"the channel {', '.join(sorted(further))}" if further else None
 
 
 def _is_photometric(term: LossTerm) -> bool:
