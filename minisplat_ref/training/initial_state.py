@@ -1,18 +1,21 @@
 """The state before the first iteration, and whether a given state belongs to a scene."""
 
+import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.frames import choose_frame
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.training.schedule import Recipe, settings_of
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Scene
+from minisplat_ref.types import FILE_FRAME, Scene
 
 
 def initial_state(
@@ -85,8 +88,18 @@ def _with_dense_points(scene: Scene, budget: int | None) -> Scene:
 
 
 def check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
-    """Refuse a state of another scene: its views, and its arrays with a row per view, must match the scene's."""
+    """Refuse a state of another scene: its views, and its arrays with a row per view, must match the scene's.
+
+    It warns of a scene that should have been moved or scaled: float32 or the near plane will spoil it.
+    """
     n_views = len(scene.train_views)
+    usual = choose_frame([view.camera for view in scene.train_views], scene.extent)
+    if scene.frame == FILE_FRAME and usual != FILE_FRAME:
+        message = (
+            f"scene {scene.name} is {scene.extent:.4g} units large and {math.hypot(*usual.origin):.4g} from the origin,"
+            " for which neither float32 nor the near plane is made: train io.frames.place_scene(scene)"
+        )
+        warnings.warn(one_line(message), InputWarning, stacklevel=3)
     if state.frame != scene.frame:
         raise InputError(
             f"scene {scene.name} is in another frame than the run to continue: place it in that of the run"

@@ -51,7 +51,7 @@ class Training(NamedTuple):
     ahead: ReadingAhead
     interruptions: Interruptions
     fetch: Callable[[TrainState], TrainState]
-    """That of the page that iterates: this one or its twin."""
+    """Of the twin that iterates."""
 
 
 def iterate(state: TrainState, training: Training) -> StepReport:

@@ -4,15 +4,11 @@ What happens in one of them is in :mod:`minisplat_ref.training.iteration`, or, o
 :mod:`minisplat_ref.training.on_device`: which of the two pages is chosen once, by the backend.
 """
 
-import math
-import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.errors import InputWarning, one_line
-from minisplat_ref.io.frames import choose_frame
 from minisplat_ref.io.stored_views import ReadingAhead
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import CPU, Backend
@@ -26,7 +22,7 @@ from minisplat_ref.training.pace import COOLED, Decision
 from minisplat_ref.training.schedule import Recipe, as_decided
 from minisplat_ref.training.smaller_views import ViewSizes
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
-from minisplat_ref.types import FILE_FRAME, Scene, number_views
+from minisplat_ref.types import Scene, number_views
 
 
 def train(
@@ -76,11 +72,10 @@ def train(
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=number_views(scene.train_views))
-    _warn_of_frame(scene)
     check_fits(state, scene, as_decided(recipe, state.pace))
     sizes, switched_on = ViewSizes(recipe, scene), None
-    page: Any = nullcontext(iteration) if backend.residence is None else on_device(backend, state)
-    with ReadingAhead() as ahead, Interruptions() as interruptions, page as page:
+    chosen: Any = nullcontext(iteration) if backend.residence is None else on_device(backend, state)
+    with ReadingAhead() as ahead, Interruptions() as interruptions, chosen as engine:
         while state.step < last_step(state, recipe):
             _cool_in_time(state, recipe)
             if state.pace.switched_on != switched_on:
@@ -88,8 +83,8 @@ def train(
                 settings = RenderSettings(scene.background, conventions, backend, decided.renderer)
             n_halvings = sizes.count_halvings(state.step + 1, state.pace)
             halved = sizes.halve(n_halvings)
-            training = Training(decided, halved, n_halvings, settings, guard, ahead, interruptions, page.fetch)
-            report = page.iterate(state, training)
+            training = Training(decided, halved, n_halvings, settings, guard, ahead, interruptions, engine.fetch)
+            report = engine.iterate(state, training)
             is_open = recipe.cooling is not None and state.pace.last_step is None
             report = report._replace(
                 last_step=None if is_open else last_step(state, recipe),
@@ -101,17 +96,6 @@ def train(
             del report  # frees its image before the next is made
             interruptions.release()
     return state
-
-
-def _warn_of_frame(scene: Scene) -> None:
-    """Warn of a scene that should have been moved or scaled: float32 or the near plane will spoil it."""
-    frame = choose_frame([view.camera for view in scene.train_views], scene.extent)
-    if scene.frame == FILE_FRAME and frame != FILE_FRAME:
-        message = (
-            f"scene {scene.name} is {scene.extent:.4g} units large and {math.hypot(*frame.origin):.4g} from the origin,"
-            " for which neither float32 nor the near plane is made: train io.frames.place_scene(scene)"
-        )
-        warnings.warn(one_line(message), InputWarning, stacklevel=3)
 
 
 def last_step(state: TrainState, recipe: Recipe, iterations: int | None = None) -> int:
