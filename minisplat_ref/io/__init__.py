@@ -38,6 +38,7 @@ def load_scene(
     undistort: bool = False,
     as_photographed: bool = False,
     model: str | None = None,
+    offset: int = 0,
 ) -> Scene:
     """Load a scene of photographs with cameras, whichever way it is described.
 
@@ -49,6 +50,8 @@ def load_scene(
         See :func:`load_colmap` and :func:`load_transforms`.
     model : str, optional
         Folder of a COLMAP model, relative to ``path``, where there are several.
+    offset : int
+        Number, below ``test_every``, of the first photograph that is held out.
 
     Returns
     -------
@@ -59,19 +62,19 @@ def load_scene(
     InputError
         If there is nothing that can be loaded, or what is there cannot.
     """
-    listing = list_scene(Path(path), test_every, model)
+    listing = list_scene(Path(path), test_every, model, offset)
     reading = build_reading(downscale, background, undistort, listing.alpha_is_mask, as_photographed)
     return build_scene(listing, reading)
 
 
-def list_scene(path: Path, test_every: int, model: str | None = None) -> Listing:
+def list_scene(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:
     """Return what :func:`load_scene` reads besides the photographs; arguments and errors are the same."""
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
     if find_model(path, model) is not None:
-        return list_colmap(path, test_every, model)
+        return list_colmap(path, test_every, model, offset)
     if find_transforms(path):
-        return list_transforms(path, test_every)
+        return list_transforms(path, test_every, offset)
     models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
     raise InputError(
         f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"

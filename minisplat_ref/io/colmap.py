@@ -94,10 +94,10 @@ def load_colmap(
     return build_scene(list_colmap(Path(path), test_every, model), reading)
 
 
-def list_colmap(path: Path, test_every: int, model: str | None = None) -> Listing:
-    """Return what :func:`load_colmap` reads besides the photographs; arguments and errors are the same."""
+def list_colmap(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:
+    """Return what :func:`load_colmap` reads besides the photographs; ``offset`` as for :func:`split_photos`."""
     reconstruction = read_model(path, model)
-    train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every)
+    train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every, offset)
     points, colors = _points(reconstruction)
     if not len(points):
         points, colors = _points_beside(path, find_model(path, model))

@@ -117,12 +117,14 @@ def build_reading(
     return Reading(int(downscale), color, undistort, alpha_is_mask, as_photographed)
 
 
-def split_photos(photos: Sequence[Photo], test_every: int) -> tuple[list[Photo], list[Photo]]:
-    """Sort by file name and hold out every ``test_every``-th, beginning with the first; 0 holds out none."""
+def split_photos(photos: Sequence[Photo], test_every: int, offset: int = 0) -> tuple[list[Photo], list[Photo]]:
+    """Sort by file name and hold out every ``test_every``-th, beginning with number ``offset``; 0 holds out none."""
     if test_every < 0:
         raise InputError(f"test_every is {test_every}; it must be 0 (no test views) or positive")
+    if not 0 <= offset < max(test_every, 1):
+        raise InputError(f"offset is {offset}; the first held-out photograph is one of the first {test_every}, from 0")
     ordered = sorted(photos, key=lambda photo: photo.path.as_posix())
-    is_test = [test_every > 0 and i % test_every == 0 for i in range(len(ordered))]
+    is_test = [test_every > 0 and i % test_every == offset for i in range(len(ordered))]
     train = [photo for photo, held_out in zip(ordered, is_test, strict=True) if not held_out]
     return train, [photo for photo, held_out in zip(ordered, is_test, strict=True) if held_out]
 

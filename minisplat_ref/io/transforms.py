@@ -79,14 +79,19 @@ def load_transforms(
     return build_scene(list_transforms(Path(path), test_every), reading)
 
 
-def list_transforms(path: Path, test_every: int) -> Listing:
-    """Return what :func:`load_transforms` reads besides the photographs; arguments and errors are the same."""
+def list_transforms(path: Path, test_every: int, offset: int = 0) -> Listing:
+    """Return what :func:`load_transforms` reads besides the photographs; ``offset`` as for :func:`split_photos`."""
     files = find_transforms(path)
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")
+    if offset and len(files) == 2:
+        raise InputError(
+            f"{path}: {files[1].name} says which photographs are held out, so that no others can be; give {files[0]} as"
+            " the scene to hold out some of that"
+        )
     sets = [read_transforms(file) for file in files[: 1 if test_every == 0 else 2]]
     photos = [[photo for _, photo in find_frames(*pair)] for pair in zip(files, sets, strict=False)]
-    train_photos, test_photos = split_photos(photos[0], test_every if len(files) == 1 else 0)
+    train_photos, test_photos = split_photos(photos[0], test_every if len(files) == 1 else 0, offset)
     if len(photos) == 2:
         test_photos, _ = split_photos(photos[1], 0)
     points_file = find_points(files[0], sets[0])

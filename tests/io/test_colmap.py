@@ -23,6 +23,22 @@ def views_of(scene):
 # Closed form
 
 
+@pytest.mark.parametrize("offset", [0, 1, 2])
+def test_folds_by_hand(tmp_path, offset):
+    """Seven photographs and K = 3: each is held out once, and the other folds train on it."""
+    folds = ["0000", "0003", "0006"], ["0001", "0004"], ["0002", "0005"]
+    scene = load_scene(write_colmap(tmp_path, n=7), test_every=3, offset=offset)
+    assert [view.name for view in scene.test_views] == folds[offset]
+    others = [name for fold in folds if fold is not folds[offset] for name in fold]
+    assert [view.name for view in scene.train_views] == sorted(others)
+
+
+@pytest.mark.parametrize(("test_every", "offset"), [(3, 3), (3, -1), (0, 1)])
+def test_an_offset_beyond_the_folds(tmp_path, test_every, offset):
+    with pytest.raises(InputError, match=f"offset is {offset}; the first held-out"):
+        load_scene(write_colmap(tmp_path), test_every=test_every, offset=offset)
+
+
 def test_cameras_points_and_split_by_hand(tmp_path):
     scene = load_colmap(write_colmap(tmp_path / "shelf", n=5), test_every=3)
     assert scene.name == "shelf"

@@ -87,6 +87,14 @@ def test_blender(tmp_path, rng, background):
     assert load_transforms(tmp_path, test_every=0).test_views == ()
 
 
+def test_folds_of_photographs_that_are_held_out_already(tmp_path, rng):
+    write_blender(tmp_path, rng)
+    with pytest.raises(InputError, match=r"transforms_test\.json says which .* give .*transforms_train\.json as"):
+        load_scene(tmp_path, test_every=2, offset=1)
+    scene = load_scene(tmp_path / "transforms_train.json", test_every=3, offset=1)
+    assert [view.name for view in scene.test_views] == ["0001"]
+
+
 def test_blender_points(tmp_path, rng):
     write_blender(tmp_path, rng)
     write_vertices(tmp_path / "points3d.ply", {"x": np.array([1.0]), "y": np.array([2.0]), "z": np.array([3.0])})

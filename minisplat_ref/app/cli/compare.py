@@ -31,6 +31,7 @@ DEFAULTS: dict[str, Any] = {
     "scene_type": None,
     "lpips_weights": None,
     "init": None,
+    "folds": None,
 }
 
 DESCRIPTION = """\
@@ -38,13 +39,17 @@ Train a scene by several recipes, in turn or by workers, and set the results
 side by side. DIR will hold a run folder RECIPE-seedS for each training,
 compare.json, the figures as PNG, and report.html with all of it.
 
-The first recipe is what the others are compared with. After Ctrl-C or a crash
---resume continues: finished trainings are kept, one that was cut off continues.
+The first recipe is what the others are compared with. With --folds K each is
+trained K times (RECIPE-foldF-seedS), and each photograph is held out once.
+After Ctrl-C or a crash --resume continues: finished trainings are kept, one
+that was cut off continues.
 """
 EPILOG = """\
 examples:
   minisplat-ref compare photos/fox --recipes 3dgs-accel,mini-splatting2 \\
       --iterations 3000,1800 --seeds 0,1,2 --out runs/fox-compared
+  minisplat-ref compare photos/fox --recipes adaptive,mini-splatting --folds 4 \\
+      --out runs/fox-folds
   minisplat-ref compare --resume runs/fox-compared --workers 2"""
 
 INTERRUPTED = 130  # exit code, of a training too
@@ -94,6 +99,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing (default 8)"
     )
+    parser.add_argument("--folds", type=integer(2), metavar="K", help="train K times: hold out each photograph once")
     parser.add_argument("--init", type=Path, metavar="START", help="as for train: points or run to start from")
     parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
     add_worker_arguments(parser)
@@ -139,8 +145,11 @@ def _new(given: dict[str, Any]) -> "Plan":
     for needed, example in (("scene", "a SCENE to train on"), ("recipes", "--recipes A,B"), ("out", "--out DIR")):
         if needed not in given:
             raise InputError(f"give {example}, or --resume DIR to continue a comparison")
+    if "folds" in given and "test_every" in given:
+        raise InputError("--folds K holds out every K-th photograph in turn: leave out --test-every")
     check_free(given["out"])
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
+    options["test_every"] = options["folds"] or options["test_every"]
     n_lengths = len(options["iterations"])
     options["iterations"] *= len(given["recipes"]) if n_lengths == 1 else 1  # a single number is for all
     return Plan(scene=Path(given["scene"]), folder=given["out"], recipes=given["recipes"], **options)

@@ -60,6 +60,7 @@ DEFAULTS: dict[str, Any] = {
     "max_drop": None,
     "max_bytes": None,
     "block": None,
+    "fold": 0,
 }
 AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new when a run is continued
 
@@ -110,6 +111,7 @@ def add_parser(commands: Commands) -> None:
         "--background", type=color, metavar="R,G,B", help="behind the scene (default 0,0,0; white 255,255,255)"
     )
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
+    data.add_argument("--fold", type=integer(0), metavar="N", help=argparse.SUPPRESS)  # one of compare --folds
     data.add_argument("--model", metavar="M", help="folder of the COLMAP model in SCENE (default sparse/0)")
 
     training = parser.add_argument_group("training")

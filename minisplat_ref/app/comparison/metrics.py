@@ -1,7 +1,7 @@
-"""What finished run folders say in numbers, and what the seeds of a recipe say together."""
+"""What finished run folders say in numbers, and what the seeds and folds of a recipe say together."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -10,6 +10,7 @@ import numpy as np
 
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.progress import read_log
+from minisplat_ref.types import NOTHING
 
 TRAINING_COPIES = 4  # the model, its gradients, and Adam's two moments, all of one size
 
@@ -51,18 +52,21 @@ METRICS = (
 RunMetrics = Mapping[str, float | None]
 """Values of one run by the keys of ``METRICS``; None where something was not measured or not reached."""
 
+PER_PHOTOGRAPH = ("psnr", "ssim", "lpips")
+"""Keys of the metrics that each test view has."""
+
 
 class Spread(NamedTuple):
-    """What several seeds give."""
+    """What several seeds, or photographs, give."""
 
     mean: float | None
     """None unless every run has a value."""
     std: float | None
-    """Sample standard deviation; None without a mean and of a single run."""
+    """Sample standard deviation; None without a mean and of a single value."""
 
 
 def spread(values: Sequence[float | None]) -> Spread:
-    """Return mean and standard deviation over seeds."""
+    """Return mean and standard deviation."""
     known = [value for value in values if value is not None]
     if len(known) < len(values):
         return Spread(None, None)
@@ -75,23 +79,39 @@ class RecipeMetrics(NamedTuple):
     recipe: str
     """Its name."""
     runs: Sequence[RunMetrics]
-    """One per seed."""
+    """One per seed and fold."""
+    photographs: Mapping[str, RunMetrics] = NOTHING
+    """With folds, by the name of each photograph, the metrics :data:`PER_PHOTOGRAPH`: its mean over the seeds."""
+
+    def is_per_photograph(self, metric: Metric) -> bool:
+        """Return whether a metric is one of each photograph, held out once."""
+        return bool(self.photographs) and metric.key in PER_PHOTOGRAPH
 
     def spread_of(self, metric: Metric) -> Spread:
-        """Return mean and standard deviation of a metric over the seeds."""
-        return spread([run[metric.key] for run in self.runs])
+        """Return mean and standard deviation of a metric over the photographs, or else over the runs."""
+        return spread(self._values_of(metric))
+
+    def error_of(self, metric: Metric) -> float | None:
+        """Return the standard error of the mean; None of a single value, or where one lacks."""
+        values = self._values_of(metric)
+        std = spread(values).std
+        return None if std is None else std / math.sqrt(len(values))
 
     def error_of_difference(self, metric: Metric, first: "RecipeMetrics") -> float | None:
-        """Return the standard error of the mean difference to the first recipe, paired by seed.
+        """Return the standard error of the mean difference to the first recipe, paired by photograph or by run.
 
         Recipes that are trained with one seed see the same views in the same order; what such a seed does to both is no
-        part of the difference. None of a single seed, or where a value lacks.
+        part of the difference, nor is how hard a photograph is. None of a single pair, or where a value lacks.
         """
-        pairs = zip((run[metric.key] for run in self.runs), (run[metric.key] for run in first.runs), strict=True)
+        pairs = zip(self._values_of(metric), first._values_of(metric), strict=True)
         differences = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
-        if len(differences) < max(2, len(self.runs)):
+        if len(differences) < max(2, len(self._values_of(metric))):
             return None
         return float(np.std(differences, ddof=1) / math.sqrt(len(differences)))
+
+    def _values_of(self, metric: Metric) -> list[float | None]:
+        sources = self.photographs.values() if self.is_per_photograph(metric) else self.runs
+        return [source[metric.key] for source in sources]
 
 
 def read_curve(folder: Path) -> list[dict[str, Any]]:
@@ -135,6 +155,18 @@ def read_metrics(folder: Path, target_psnr: float, render_fps: float) -> dict[st
         "densified_mb": densified,
         "render_fps": render_fps,
         "ply_bytes": (folder / run_folder.POINT_CLOUD).stat().st_size,
+    }
+
+
+def read_photographs(folders: Iterable[Path]) -> dict[str, dict[str, float | None]]:
+    """Return the metrics of each photograph that some finished runs have measured, the mean where several have."""
+    found: dict[str, list[Mapping[str, float | None]]] = {}
+    for folder in folders:
+        for view in run_folder.read_json_object(folder / run_folder.METRICS)["per_view"]:
+            found.setdefault(view["name"], []).append(view)
+    return {
+        name: {key: spread([view[key] for view in views]).mean for key in PER_PHOTOGRAPH}
+        for name, views in sorted(found.items())
     }
 
 

@@ -8,7 +8,7 @@ from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.start import start_from
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.io import load_scene
+from minisplat_ref.io import list_scene, load_scene
 from minisplat_ref.io.frames import place_scene
 from minisplat_ref.metrics.lpips import check_views, load_network
 from minisplat_ref.training.schedule import describe
@@ -38,10 +38,12 @@ class Run(NamedTuple):
     """The run folder."""
     options: dict[str, object]
     """Options of ``train`` that this recipe takes and not every one does, without those that are left to the recipe."""
+    fold: int = 0
+    """Number of the first photograph that is held out; above 0 only with folds."""
 
 
 class Plan(NamedTuple):
-    """A comparison, checked: every recipe with every seed."""
+    """A comparison, checked: every recipe with every seed and fold."""
 
     scene: Path
     """Folder or file of the scene, as it was given."""
@@ -69,6 +71,8 @@ class Plan(NamedTuple):
     """File of the weights of LPIPS; None: it is not measured."""
     init: Path | None = None
     """PLY of the points, or folder of the run, that every training starts from; None for the scene's own points."""
+    folds: int | None = None
+    """Trainings of each recipe, ``test_every`` as well, which hold out each photograph once; None: one training."""
 
     @property
     def files(self) -> dict[str, str]:
@@ -82,17 +86,19 @@ class Plan(NamedTuple):
 
     @property
     def runs(self) -> list[Run]:
-        """All trainings in their order: seed by seed, so that a machine that slows down does so for every recipe."""
+        """All trainings in their order: recipes alternate, so that a machine that slows down does so for each."""
         return [
             Run(
                 recipe,
                 iterations,
                 seed,
                 self.eval_every or max(1, round(iterations / POINTS_PER_RUN)),
-                self.folder / f"{recipe}-seed{seed}",
+                self.folder / f"{recipe}{'' if self.folds is None else f'-fold{fold}'}-seed{seed}",
                 self._options_of(recipe),
+                fold,
             )
             for seed in self.seeds
+            for fold in range(self.folds or 1)
             for recipe, iterations in zip(self.recipes, self.iterations, strict=True)
         ]
 
@@ -128,8 +134,8 @@ def check(plan: Plan) -> Scene:
     ------
     InputError
         A recipe is unknown or named twice, there is no length for each, no recipe takes an option, the scene cannot be
-        loaded, has no test views or too few to train on, or the weights of LPIPS or the points to start from are not
-        what they should be.
+        loaded, has no test views or too few to train on, or fewer photographs than folds, or the weights of LPIPS or
+        the points to start from are not what they should be.
     """
     for name, values in (("--recipes", plan.recipes), ("--seeds", plan.seeds)):
         _refuse_repetition(name, values)
@@ -141,14 +147,29 @@ def check(plan: Plan) -> Scene:
     for option in plan.options:
         if not any(_takes(recipe.name, option) for recipe in recipes):
             raise InputError(f"--{option.replace('_', '-')} means nothing to {', '.join(plan.recipes)}: leave it out")
-    scene = place_scene(load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every))
+    if plan.folds is not None:
+        _check_folds(plan.scene, plan.folds)
+    scene = scene_of(plan)  # the first fold leaves the fewest photographs to train on
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare on: give --test-every above 0")
     if plan.lpips_weights is not None:
-        check_views(load_network(plan.lpips_weights), scene.test_views)
+        measured = scene.test_views if plan.folds is None else (*scene.train_views, *scene.test_views)
+        check_views(load_network(plan.lpips_weights), measured)
     for recipe in recipes:
         start_from(plan.init, scene, recipe, seed=0)
     return scene
+
+
+def scene_of(plan: Plan, fold: int = 0) -> Scene:
+    """Load the scene as the trainings of a fold have it."""
+    return place_scene(load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every, offset=fold))
+
+
+def _check_folds(scene: Path, folds: int) -> None:
+    last = list_scene(scene, folds, offset=folds - 1)
+    if not last.test_photos:
+        n = len(last.train_photos)
+        raise InputError(f"{scene} has {n} photographs for {folds} folds: give --folds of at most {n}")
 
 
 def _refuse_repetition(option: str, values: Sequence[object]) -> None:

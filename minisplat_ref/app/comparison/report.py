@@ -15,10 +15,11 @@ from minisplat_ref.app.comparison.figures import (
 from minisplat_ref.app.comparison.metrics import METRICS, RecipeMetrics
 from minisplat_ref.app.comparison.plan import Plan
 from minisplat_ref.app.comparison.results import Results
-from minisplat_ref.app.comparison.table import table_cells
+from minisplat_ref.app.comparison.table import photograph_cells, table_cells
 from minisplat_ref.app.reports.page import (
     cards,
     curves,
+    folded,
     grid,
     make_list,
     page,
@@ -50,6 +51,8 @@ def notes(plan: Plan, results: Results) -> list[str]:
     first = plan.recipes[0]
     seeds = ", ".join(map(str, plan.seeds))
     values = f"Mean and standard deviation of seeds {seeds}" if len(plan.seeds) > 1 else f"Seed {seeds}"
+    if plan.folds is not None:
+        values = f"Otherwise: mean and standard deviation of {plan.folds} folds, {_seeds_in_words(plan)}"
     steps = ", ".join(f"{n}" for n in dict.fromkeys(run.eval_every for run in plan.runs))
     sentences = [
         f"{values}; in brackets the ratio to {first}, or the difference from it.",
@@ -61,7 +64,9 @@ def notes(plan: Plan, results: Results) -> list[str]:
         "Peak memory of the process: photographs, compiler and measuring included, LPIPS not.",
         "Rendering: all models in one process, interleaved, the median of several rounds.",
     ]
-    if len(plan.seeds) > 1:
+    if plan.folds is not None:
+        sentences.insert(0, _describe_folds(plan, results.recipes[0]))
+    elif len(plan.seeds) > 1:
         sentences.insert(
             1,
             "After a difference stands its standard error: the deviation of the differences between runs of one seed,"
@@ -78,30 +83,55 @@ def notes(plan: Plan, results: Results) -> list[str]:
     return [*sentences, f"LPIPS by {results.lpips_network}, colours from -1 to 1; 0 is equal."]
 
 
+def _seeds_in_words(plan: Plan) -> str:
+    return f"seed{'s'[: len(plan.seeds) > 1]} {', '.join(map(str, plan.seeds))}"
+
+
+def _describe_folds(plan: Plan, first: RecipeMetrics) -> str:
+    of_seeds = ", each the mean of its seeds" if len(plan.seeds) > 1 else ""
+    return (
+        f"PSNR, SSIM and LPIPS: each of the {len(first.photographs)} photographs was held out once, from one of"
+        f" {plan.folds} trainings. Mean of the photographs{of_seeds}, and its standard error; in brackets the"
+        f" difference from {first.recipe}, photograph by photograph, and the standard error of its mean. These errors"
+        " take the photographs for independent, while those of a fold share a training."
+    )
+
+
 def report_html(plan: Plan, scene: Scene, results: Results) -> str:
     """Return the page as text of one self-contained HTML file."""
     n_train, n_test = len(scene.train_views), len(scene.test_views)
     introduction = (
         f"The same {n_train} photographs, trained in {len(plan.recipes)} ways on the CPU,"
         f" and measured on {n_test} more that no training saw."
+        if plan.folds is None
+        else f"{n_train + n_test} photographs in {plan.folds} folds, trained in {len(plan.recipes)} ways on the CPU:"
+        " each photograph is measured where it was held out."
     )
     heading, *cells = table_cells(results.recipes)
     sections = [
         cards(map(_card, results.recipes)),
         section("Measures", table(cells, heading), make_list(notes(plan, results))),
+        *_photographs(plan, results),
         section("On the way", paragraph(CURVES_TEXT), _curves(results)),
         section("What fired, and when", paragraph(FIRED_TEXT), *(_fired_table(fired) for fired in results.fired)),
         section(
             "Parts of held-out views",
             paragraph(
                 "Half of them are where the recipes differ most, the others where there is most detail;"
-                f" seed {plan.seeds[0]}."
+                f" seed {plan.seeds[0]}{'' if plan.folds is None else ', fold 0'}."
             ),
             grid([_crop_panel(crop, plan.recipes) for crop in results.crops], is_smooth=False),
         ),
         section("What was run", table(_settings(plan, scene, results))),
     ]
     return page(f"{_enumerate(plan.recipes)} on {scene.name}", introduction, sections)
+
+
+def _photographs(plan: Plan, results: Results) -> list[str]:
+    if plan.folds is None:
+        return []
+    heading, *cells = photograph_cells(results.recipes)
+    return [folded("Photograph by photograph", table(cells, heading))]
 
 
 def _card(recipe: RecipeMetrics) -> tuple[str, str]:
@@ -140,8 +170,8 @@ def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str
     return [
         (
             "Scene",
-            f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
-            f" {camera.width} x {camera.height} pixels, {len(scene.points):,} points",
+            f"{scene.name}: {_describe_views(plan, scene)} of {camera.width} x {camera.height} pixels,"
+            f" {len(scene.points):,} points",
         ),
         ("Iterations", ", ".join(f"{recipe} {iterations:,}" for recipe, iterations in lengths)),
         ("Seeds", ", ".join(map(str, plan.seeds))),
@@ -151,6 +181,13 @@ def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str
         ("Program", f"minisplat_ref {__version__}"),
         ("Files", f"{plan.folder.resolve()}: a folder per run, compare.json, the figures as PNG"),
     ]
+
+
+def _describe_views(plan: Plan, scene: Scene) -> str:
+    n_train, n_test = len(scene.train_views), len(scene.test_views)
+    if plan.folds is None:
+        return f"{n_train} training and {n_test} test views"
+    return f"{n_train + n_test} photographs in {plan.folds} folds"
 
 
 def _enumerate(names: Sequence[str]) -> str:

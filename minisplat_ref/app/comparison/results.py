@@ -2,18 +2,21 @@
 
 import platform
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.app.comparison.crops import Crop, choose_crops
 from minisplat_ref.app.comparison.metrics import (
     METRICS,
+    PER_PHOTOGRAPH,
     RecipeMetrics,
     final_psnr,
     read_curve,
     read_metrics,
+    read_photographs,
     relation,
 )
-from minisplat_ref.app.comparison.plan import Plan
+from minisplat_ref.app.comparison.plan import Plan, scene_of
 from minisplat_ref.app.comparison.speed import render_rates
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
@@ -21,7 +24,7 @@ from minisplat_ref.app.runs.fired import Fired
 from minisplat_ref.app.runs.scoring import load_trained
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.reporting import describe_machine
-from minisplat_ref.types import Scene
+from minisplat_ref.types import NOTHING, Scene
 
 
 class Results(NamedTuple):
@@ -30,11 +33,11 @@ class Results(NamedTuple):
     recipes: Sequence[RecipeMetrics]
     """Measures, in the order of the plan."""
     curves: dict[str, list[list[dict[str, Any]]]]
-    """For every recipe the records of ``curve.jsonl`` of each seed."""
+    """For every recipe the records of ``curve.jsonl`` of each run."""
     fired: Sequence[Fired]
     """Which mechanisms acted, in the order of the plan."""
     crops: Sequence[Crop]
-    """Parts of test views, rendered with the first seed of each recipe."""
+    """Parts of test views, rendered with the first run of each recipe."""
     lpips_reason: str | None
     """Why LPIPS is missing."""
     lpips_network: str | None
@@ -51,19 +54,23 @@ def collect(plan: Plan, scene: Scene) -> Results:
     plan : Plan
         All its runs are finished.
     scene : Scene
-        As it was loaded for the plan.
+        As it was loaded for the plan, that of the first fold.
     """
     runs = plan.runs
-    models = [load_trained(run.folder) for run in runs]
-    rates = dict(zip((run.folder for run in runs), render_rates(models, scene), strict=True))
-    targets = {run.seed: final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
-    recipes = [
-        RecipeMetrics(
-            recipe, [read_metrics(run.folder, targets[run.seed], rates[run.folder]) for run in plan.runs_of(recipe)]
-        )
-        for recipe in plan.recipes
-    ]
-    shown = [model for run, model in zip(runs, models, strict=True) if run.seed == plan.seeds[0]]
+    models = {run.folder: load_trained(run.folder) for run in runs}
+    rates: dict[Path, float] = {}
+    for fold in range(plan.folds or 1):
+        own = [run.folder for run in runs if run.fold == fold]
+        fold_scene = scene if fold == 0 else scene_of(plan, fold)
+        rates |= zip(own, render_rates([models[folder] for folder in own], fold_scene), strict=True)
+    targets = {(run.seed, run.fold): final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
+    recipes = []
+    for recipe in plan.recipes:
+        own_runs = plan.runs_of(recipe)
+        of_runs = [read_metrics(run.folder, targets[run.seed, run.fold], rates[run.folder]) for run in own_runs]
+        photographs = NOTHING if plan.folds is None else read_photographs(run.folder for run in own_runs)
+        recipes.append(RecipeMetrics(recipe, of_runs, photographs))
+    shown = [models[run.folder] for run in runs[: len(plan.recipes)]]
     metrics = run_folder.read_json_object(runs[0].folder / run_folder.METRICS)
     return Results(
         recipes=recipes,
@@ -132,14 +139,24 @@ def _recipe_to_json(plan: Plan, recipe: RecipeMetrics, first: RecipeMetrics, fir
             for metric in METRICS
             if metric.relation == "difference"
         },
+        **({} if plan.folds is None else _validation_to_json(recipe)),
         "never_fired": fired.never,
         "runs": [
             {
                 "seed": run.seed,
+                **({} if plan.folds is None else {"fold": run.fold}),
                 "folder": run.folder.name,
                 **metrics,
                 "mechanisms": [mechanism._asdict() for mechanism in mechanisms],
             }
             for run, metrics, mechanisms in runs
         ],
+    }
+
+
+def _validation_to_json(recipe: RecipeMetrics) -> dict[str, Any]:
+    """Return what folds add to a recipe: the metrics of each photograph, and the errors of their means."""
+    return {
+        "standard_error": {metric.key: recipe.error_of(metric) for metric in METRICS if metric.key in PER_PHOTOGRAPH},
+        "photographs": recipe.photographs,
     }

@@ -45,7 +45,7 @@ def statuses(plan: Plan) -> list[Status]:
 
 
 def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
-    """Train every recipe with every seed, as far as it goes.
+    """Train every recipe with every seed and fold, as far as it goes.
 
     Parameters
     ----------
@@ -128,7 +128,8 @@ def _first_words(plan: Plan, run: Run) -> list[str]:
 
 def _name(plan: Plan, number: int) -> str:
     run = plan.runs[number]
-    return f"run {number + 1} of {len(plan.runs)}: {run.recipe}, seed {run.seed}, {run.iterations} iterations"
+    fold = "" if plan.folds is None else f" fold {run.fold},"
+    return f"run {number + 1} of {len(plan.runs)}: {run.recipe},{fold} seed {run.seed}, {run.iterations} iterations"
 
 
 def settings_of(plan: Plan, run: Run) -> Settings:
@@ -151,6 +152,7 @@ def _options(plan: Plan, run: Run) -> dict[str, Any]:
         "seed": run.seed,
         "downscale": plan.downscale,
         "test_every": plan.test_every,
+        **({} if plan.folds is None else {"fold": run.fold}),
         "eval_every": run.eval_every,
         **plan.files,
         **run.options,

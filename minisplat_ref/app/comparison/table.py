@@ -13,6 +13,23 @@ def table_cells(recipes: Sequence[RecipeMetrics]) -> list[list[str]]:
     return [heading, *([metric.title, *_row(metric, recipes)] for metric in METRICS if _is_known(metric, recipes))]
 
 
+def photograph_cells(recipes: Sequence[RecipeMetrics]) -> list[list[str]]:
+    """Return the table of the PSNR of each photograph that was held out once, with the differences from the first."""
+
+    def cell(ours: float | None, first: float | None, is_first: bool) -> str:
+        if ours is None:
+            return "null"
+        return f"{ours:.2f}" + ("" if is_first or first is None else f" ({ours - first:+.2f})")
+
+    heading = ["PSNR (dB)", *(recipe.recipe for recipe in recipes)]
+    first = recipes[0].photographs
+    rows = [
+        [name, *(cell(r.photographs[name]["psnr"], first[name]["psnr"], r is recipes[0]) for r in recipes)]
+        for name in first
+    ]
+    return [heading, *rows]
+
+
 def _is_known(metric: Metric, recipes: Sequence[RecipeMetrics]) -> bool:
     """Return False for the distance to a true surface where there is no such thing; what else lacks is told."""
     return metric.key != "chamfer" or any(run[metric.key] is not None for recipe in recipes for run in recipe.runs)
@@ -29,7 +46,8 @@ def _value(metric: Metric, recipe: RecipeMetrics) -> str:
     mean, std = recipe.spread_of(metric)
     if mean is None:
         return _missing(metric, recipe)
-    deviation = "" if std is None else f" ± {std:{metric.format}}"
+    width = recipe.error_of(metric) if recipe.is_per_photograph(metric) else std
+    deviation = "" if width is None else f" ± {width:{metric.format}}"
     return f"{mean:{metric.format}}{deviation}"
 
 

@@ -64,6 +64,7 @@ def evaluate_run(
     asked = settings._replace(
         scene=str(scene or settings.scene),
         test_every=settings.test_every if test_every is None else test_every,
+        fold=settings.fold if test_every is None else 0,
         lpips_weights=settings.lpips_weights if lpips_weights is None else str(lpips_weights),
     )
     saved, frame = newest_model(folder, settings), load_frame(folder)

@@ -9,7 +9,7 @@ HEADING = ("mechanism", "times", "published", "first step", "last step", "added"
 
 
 class Fired(NamedTuple):
-    """What a recipe has done, in the runs of all seeds."""
+    """What a recipe has done, in all its runs."""
 
     recipe: str
     iterations: int
@@ -19,7 +19,7 @@ class Fired(NamedTuple):
     published: dict[str, int]
     """How often each mechanism acts in the recipe as published."""
     runs: Sequence[Sequence[Mechanism]]
-    """Per seed, what its mechanisms have done."""
+    """Per run, what its mechanisms have done."""
 
     @property
     def never(self) -> list[str]:
@@ -28,7 +28,7 @@ class Fired(NamedTuple):
 
 
 def rows(fired: Fired) -> list[list[str]]:
-    """Return the table under HEADING: a row per mechanism that has acted, the range where the seeds differ."""
+    """Return the table under HEADING: a row per mechanism that has acted, the range where runs differ."""
     table = []
     for action in dict.fromkeys(mechanism.action for run in fired.runs for mechanism in run):
         own = [mechanism for run in fired.runs for mechanism in run if mechanism.action == action]
@@ -70,7 +70,7 @@ def _never(fired: Fired) -> dict[str, list[str]]:
 
 
 def _range(values: Iterable[int]) -> str:
-    """Return the value on which the seeds agree, or the least and the largest."""
+    """Return the value on which the runs agree, or the least and the largest."""
     values = list(values)
     low, high = min(values), max(values)
     return f"{low:,}" if low == high else f"{low:,} to {high:,}"

@@ -101,6 +101,8 @@ class Settings(NamedTuple):
     """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
     block: str | None = None
     """Absolute path of the part of the scene, a :class:`~minisplat_ref.app.runs.part.Part`; None for the whole."""
+    fold: int = 0
+    """Offset of the first held-out photograph, below ``test_every``: one fold of a cross-validation."""
 
 
 def recipe_of(settings: Settings) -> Recipe:
@@ -280,7 +282,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
 
 def list_photographs(settings: Settings) -> Listing:
     """Return what is known of the whole scene of a run before its photographs are read; errors as for the scene."""
-    return list_scene(Path(settings.scene), settings.test_every, settings.model)
+    return list_scene(Path(settings.scene), settings.test_every, settings.model, settings.fold)
 
 
 def load_photographs(settings: Settings, frame: Frame | None = None, listing: Listing | None = None) -> Scene:

@@ -57,6 +57,7 @@ def open_run(folder: Path, scene: Path | None = None) -> OpenRun:
         settings = config["settings"]
         name, extension, profile = settings["recipe"], settings["extension"], PROFILES[settings["profile"]]
         reading = {key: settings[key] for key in ("downscale", "test_every", "background", "undistort", "model")}
+        reading["offset"] = settings.get("fold", 0)
         path, frame = Path(scene or settings["scene"]), frame_from_json(config.get("frame"))
     except (KeyError, TypeError) as error:
         raise InputError(

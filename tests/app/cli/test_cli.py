@@ -122,6 +122,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "init": None,
         "background": None,
         "block": None,
+        "fold": 0,
         "model": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
