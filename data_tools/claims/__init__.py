@@ -1,9 +1,9 @@
 """Claims of papers, measured: ``python -m data_tools.claims NAME ...``, in a clone of the repository.
 
-Each module or folder beside ``kit`` has the claims of one paper or of one decision of ours, listed in ``CLAIMS``.
-NAME is that of the module, followed by that of the claim where a module has several: ``folds``,
-``textured/limb``. Nothing that is installed imports them: a claim that has been decided keeps its figures in ``docs``,
-and its script stays here, so that anyone can repeat it.
+Each module or folder beside ``kit`` has the claims of one paper, which its first lines name, or of one decision of
+ours, listed in ``CLAIMS``. NAME is that of the module, followed by that of the claim where a module has several:
+``folds``, ``textured/limb``. Nothing that is installed imports them: a claim that has been decided keeps its figures in
+``docs``, and its script stays here, so that anyone can repeat it.
 """
 
 from importlib import import_module

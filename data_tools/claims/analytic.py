@@ -1,9 +1,9 @@
-"""The study ``analytic/footprint``: alphas of one Gaussian in the pixels around it against exact integrals.
+"""Claim ``analytic/footprint``: alphas of one Gaussian in the pixels around it against exact integrals.
 
-The truth of a round Gaussian is a product of differences of error functions; that of a needle at an angle is the mean
-of 48 x 48 values per pixel. Compared with it are the value at the pixel's centre, that value with the dilation of 3DGS
-or with Mip-Splatting's filter, which keeps the integral, and the integral along the footprint's axes with either
-distribution function.
+The paper is Analytic-Splatting, arXiv 2403.11056. The truth of a round Gaussian is a product of differences of error
+functions; that of a needle at an angle is the mean of 48 x 48 values per pixel. Compared with it are the value at the
+pixel's centre, that value with the dilation of 3DGS or with Mip-Splatting's filter, which keeps the integral, and the
+integral along the footprint's axes with either distribution function.
 """
 
 import argparse
@@ -139,12 +139,13 @@ def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
     return figure
 
 
-FOOTPRINT = declare(
-    "footprint",
-    "alpha of one Gaussian against its integral over pixels",
-    run,
-    OUT,
-    number("--places", 64, "positions within a pixel"),
-    seed("of positions and angles"),
+CLAIMS = (
+    declare(
+        "footprint",
+        "alpha of one Gaussian against its integral over pixels",
+        run,
+        OUT,
+        number("--places", 64, "positions within a pixel"),
+        seed("of positions and angles"),
+    ),
 )
-CLAIMS = (FOOTPRINT,)

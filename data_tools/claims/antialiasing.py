@@ -1,4 +1,4 @@
-"""The study ``antialiasing/zoom``: scenes trained at one size, seen from farther and from nearer.
+"""Claim ``antialiasing/zoom`` (arXiv 2311.16493): scenes trained at one size, seen from farther and from nearer.
 
 Training uses photographs at 1/D of their size. Test views are drawn with the same camera and more or fewer pixels, and
 compared with means over blocks of the photographs' pixels; so zooms of more than D have no truth. Each of
@@ -99,7 +99,7 @@ def _photograph(view: View, n: int) -> Floats:
 
 
 class Measured(NamedTuple):
-    """The results of the study."""
+    """The results."""
 
     zooms: list[float]
     """Pixels per side, relative to the training views."""
@@ -164,10 +164,11 @@ def draw(found: Measured) -> Figure:
     return figure
 
 
-ZOOM = declare(
-    "zoom",
-    "a scene seen from farther and nearer than in training",
-    run,
-    *(scene("room"), OUT, downscale(4), iterations(1000), seeds(2)),
+CLAIMS = (
+    declare(
+        "zoom",
+        "a scene seen from farther and nearer than in training",
+        run,
+        *(scene("room"), OUT, downscale(4), iterations(1000), seeds(2)),
+    ),
 )
-CLAIMS = (ZOOM,)

@@ -1,11 +1,11 @@
-"""The study ``compression/rate-distortion``: what bytes cost in quality, and what a fixed step costs in a small scene.
+"""Claim ``compression/rate-distortion``: what bytes cost in quality, and what a fixed step costs in a small scene.
 
-The Gaussians come from a training or from a PLY. They are written at every level of every format of this extension,
-read again and measured on the test views; so is the PLY itself and, if ``--splat-transform`` names that program of
-PlayCanvas, its SOG. Sizes are those of whole files.
+The claim is ours. The Gaussians come from a training or from a PLY. They are written at every level of every format of
+this extension, read again and measured on the test views; so is the PLY itself and, if ``--splat-transform`` names that
+program of PlayCanvas, its SOG. Sizes are those of whole files.
 
 SPZ has a fixed step of 2^-12 world units for centres and a fixed range for scales; the step of ``.msz`` follows the
-small Gaussians. So the study also makes the scene smaller and smaller, with Gaussians, cameras and near plane together:
+small Gaussians. So this also makes the scene smaller and smaller, with Gaussians, cameras and near plane together:
 every image stays the same, and so should the loss of a file.
 
 SPZ's harmonics have 4 and 5 bits. What they cost is the difference from a file that keeps them as they were.
@@ -211,11 +211,12 @@ def _draw_kind(axes: Axes, kind: str, runs: list[list[dict[str, Any]]]) -> None:
     plot_deviations(axes, sizes, losses, fmt="-o" if kind == "msz" else "s", color=COLORS[kind], label=f".{kind}")
 
 
-RATE_DISTORTION = declare(
-    "rate-distortion",
-    "bytes against quality: .msz beside PLY, SPZ and SOG",
-    run,
-    *trainings(1000, "mini-splatting2"),
-    argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program"),
+CLAIMS = (
+    declare(
+        "rate-distortion",
+        "bytes against quality: .msz beside PLY, SPZ and SOG",
+        run,
+        *trainings(1000, "mini-splatting2"),
+        argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program"),
+    ),
 )
-CLAIMS = (RATE_DISTORTION,)

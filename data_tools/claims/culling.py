@@ -1,9 +1,10 @@
 """Visibility culling of Mini-Splatting2: what it removes beyond the frustum, the time it saves, and its cost.
 
-The recipe is trained up to two points: before the simplification, where there are many Gaussians, and before culling
-ends, where there are few. The photographs have their full size throughout. At each point the visibility table is
-measured again, as the recipe's events do, and the training is continued twice from the same state, with the table and
-without, one iteration of each alternately. Gaussians from a PLY are measured as they are.
+The paper is Mini-Splatting2, arXiv 2411.12788. The recipe is trained up to two points: before the simplification, where
+there are many Gaussians, and before culling ends, where there are few. The photographs have their full size throughout.
+At each point the visibility table is measured again, as the recipe's events do, and the training is continued twice
+from the same state, with the table and without, one iteration of each alternately. Gaussians from a PLY are measured as
+they are.
 """
 
 import argparse
@@ -203,17 +204,18 @@ def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
     return figure
 
 
-CULLING = declare(
-    "culling",
-    "visibility culling: what it removes, and the time it saves",
-    run,
-    SCENE,
-    OUT,
-    downscale(),
-    iterations(1800),
-    PLY,
-    seed("of the training"),
-    number("--repeats", 100, "iterations to time, of either kind"),
-    description="Train a scene with mini-splatting2, and measure what visibility culling does.",
+CLAIMS = (
+    declare(
+        "culling",
+        "visibility culling: what it removes, and the time it saves",
+        run,
+        SCENE,
+        OUT,
+        downscale(),
+        iterations(1800),
+        PLY,
+        seed("of the training"),
+        number("--repeats", 100, "iterations to time, of either kind"),
+        description="Train a scene with mini-splatting2, and measure what visibility culling does.",
+    ),
 )
-CLAIMS = (CULLING,)

@@ -1,8 +1,8 @@
 """Planted defects: whether ``adaptive`` finds them, and none where there are none.
 
-Photographs of a scene are disturbed in a known way, differently in every trial, and the scene is trained until the
-iteration in which ``adaptive`` has decided about a sky, exposures, poses and anti-aliasing. A trial records what was
-switched on. Its seed is used for the disturbance and the training.
+The claim is ours. Photographs of a scene are disturbed in a known way, differently in every trial, and the scene is
+trained until the iteration in which ``adaptive`` has decided about a sky, exposures, poses and anti-aliasing. A trial
+records what was switched on. Its seed is used for the disturbance and the training.
 
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have other defects
@@ -214,26 +214,27 @@ def draw(summary: Mapping[str, Mapping[str, int]], asked: Sequence[str]) -> Figu
     return figure
 
 
-DEFECTS = declare(
-    "defects",
-    "planted defects of photographs: found where they are, nowhere else",
-    run,
-    *RESUMED_SCENE,
-    argument(
-        "--conditions",
-        type=NAMES,
-        default=(),
-        metavar="C,D",
-        help="clean, gains, poses, sizes, sky (default: all, sky of synthetic scenes alone)",
+CLAIMS = (
+    declare(
+        "defects",
+        "planted defects of photographs: found where they are, nowhere else",
+        run,
+        *RESUMED_SCENE,
+        argument(
+            "--conditions",
+            type=NAMES,
+            default=(),
+            metavar="C,D",
+            help="clean, gains, poses, sizes, sky (default: all, sky of synthetic scenes alone)",
+        ),
+        argument(
+            "--asked",
+            type=NAMES,
+            default=("sky", "exposure", "pose", "antialiasing"),
+            metavar="A,B",
+            help="train until it is decided about these alone (default: all: sky,exposure,pose,antialiasing)",
+        ),
+        number("--trials", 10, "of each kind"),
+        description=f"Disturb photographs of a scene in known ways, and count what adaptive switches on. {CONTINUES}",
     ),
-    argument(
-        "--asked",
-        type=NAMES,
-        default=("sky", "exposure", "pose", "antialiasing"),
-        metavar="A,B",
-        help="train until it is decided about these alone (default: all: sky,exposure,pose,antialiasing)",
-    ),
-    number("--trials", 10, "of each kind"),
-    description=f"Disturb the photographs of a scene in known ways, and count what adaptive switches on. {CONTINUES}",
 )
-CLAIMS = (DEFECTS,)

@@ -1,4 +1,6 @@
-"""The studies ``discretized-sdf/sphere`` and ``discretized-sdf/relight``: noisy surfels, and a glossy sphere relit.
+"""Claims ``discretized-sdf/sphere`` and ``discretized-sdf/relight``: noisy surfels, and a glossy sphere relit.
+
+The paper is Discretized SDF Gaussian Splatting, arXiv 2507.15629.
 
 *sphere*: tangent surfels lie up to a tenth of the radius off a sphere, with distances that know nothing of it. In 200
 steps the projection loss alone moves centres and distances, while normals stay. Opacities stay as they were, or follow
@@ -301,19 +303,7 @@ def _scaled(found: Floats, exact: Floats) -> Floats:
     return found * factors
 
 
-SPHERE = declare(
-    "sphere",
-    "noisy surfels around a sphere: what projection does",
-    run_sphere,
-    *(OUT, seeds(3)),
-)
-RELIGHT = declare(
-    "relight",
-    "a glossy sphere relit, beside Ref-Gaussian",
-    run_relight,
-    *(OUT, iterations(2000), seeds(3)),
-)
 CLAIMS = (
-    SPHERE,
-    RELIGHT,
+    declare("sphere", "noisy surfels around a sphere: what projection does", run_sphere, *(OUT, seeds(3))),
+    declare("relight", "a glossy sphere relit, beside Ref-Gaussian", run_relight, *(OUT, iterations(2000), seeds(3))),
 )

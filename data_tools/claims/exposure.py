@@ -1,10 +1,10 @@
 """Exposures: multiply photographs by known gains, which the training has to recover.
 
-Every photograph of a synthetic scene is mapped by ``T_v``, a gain per channel and an offset. The scene is trained three
-times: on the original photographs, on the disturbed ones, and on these with exposures. The resulting maps E_v are
-determined up to one map that all share: the scene may have the colours ``K [c; 1]`` as long as ``E_v K = T_v``. K is
-fitted by least squares before anything is compared, and held-out renderings are mapped back by its inverse. Without
-exposures every E_v is the identity, and K the best single map.
+The claim is ours. Every photograph of a synthetic scene is mapped by ``T_v``, a gain per channel and an offset. The
+scene is trained three times: on the original photographs, on the disturbed ones, and on these with exposures. The
+resulting maps E_v are determined up to one map that all share: the scene may have the colours ``K [c; 1]`` as long as
+``E_v K = T_v``. K is fitted by least squares before anything is compared, and held-out renderings are mapped back by
+its inverse. Without exposures every E_v is the identity, and K the best single map.
 
 Maps are compared by their effect on the colours in the photographs: those are mostly near gray and hardly determine the
 nine entries of A_v individually.
@@ -150,10 +150,4 @@ def draw(result: dict[str, dict[str, Any]]) -> Figure:
     return figure
 
 
-EXPOSURE = declare(
-    "exposure",
-    "exposure per photograph: disturbed by known maps, and recovered",
-    run,
-    *CALIBRATION,
-)
-CLAIMS = (EXPOSURE,)
+CLAIMS = (declare("exposure", "exposure per photograph: disturbed by known maps, and recovered", run, *CALIBRATION),)

@@ -6,8 +6,9 @@ the other photographs have found are left out. Each photograph is measured as re
 its colours, because nothing says what exposure it had; and once more in the pixels that at least two training
 photographs show (:mod:`.coverage`), because the others are guessed.
 
-Several scenes may be given. Then the study also compares the first recipe, fold by fold, with the best other one of the
-scene, and chooses among all recipes as one must: on the other scenes, and reports the choice on the one left out.
+Several scenes may be given. Then the first recipe is also compared, fold by fold, with the best other one of the scene,
+and a recipe is chosen as one must: on the other scenes, to be reported on the one left out. The claim is ours;
+``minisplat-ref compare --folds`` is the command for one scene.
 """
 
 import argparse
@@ -357,30 +358,31 @@ def draw(records: Sequence[Mapping[str, Any]], recipes: Sequence[str]) -> Figure
     return figure
 
 
-FOLDS = declare(
-    "folds",
-    "recipes photograph by photograph: each is held out once",
-    run,
-    argument("scenes", nargs="+", metavar="SCENE", help="folders of scenes, or synthetic ones"),
-    RESUMED_OUT,
-    number("--folds", 4, "held out is every K-th photograph", minimum=2, metavar="K"),
-    argument(
-        "--recipes",
-        type=NAMES,
-        default=("adaptive", "3dgs-accel", "mini-splatting", "mini-splatting2"),
-        metavar="R,Q",
-        help="the first is compared with the others; R+NAME=VALUE changes a setting (default: adaptive, and three of"
-        " 3000 iterations)",
+CLAIMS = (
+    declare(
+        "folds",
+        "recipes photograph by photograph: each is held out once",
+        run,
+        argument("scenes", nargs="+", metavar="SCENE", help="folders of scenes, or synthetic ones"),
+        RESUMED_OUT,
+        number("--folds", 4, "held out is every K-th photograph", minimum=2, metavar="K"),
+        argument(
+            "--recipes",
+            type=NAMES,
+            default=("adaptive", "3dgs-accel", "mini-splatting", "mini-splatting2"),
+            metavar="R,Q",
+            help="the first is compared with the others; R+NAME=VALUE changes a setting (default: adaptive, and three"
+            " of 3000 iterations)",
+        ),
+        argument(
+            "--photographs",
+            choices=("whole", "thinned", "both"),
+            default="whole",
+            metavar="P",
+            help="whole: all photographs (default); thinned: about ten; both",
+        ),
+        number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
+        SEEDS,
+        description="Hold out each photograph once, train recipes on the others, and measure. " + CONTINUES,
     ),
-    argument(
-        "--photographs",
-        choices=("whole", "thinned", "both"),
-        default="whole",
-        metavar="P",
-        help="whole: all photographs (default); thinned: about ten; both",
-    ),
-    number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
-    SEEDS,
-    description="Hold out each photograph once, train recipes on the others, and measure. " + CONTINUES,
 )
-CLAIMS = (FOLDS,)

@@ -1,9 +1,9 @@
-"""The study ``games/counts``: Gaussians on the faces of a mesh against free ones, as many, of a synthetic scene.
+"""Claim ``games/counts``: Gaussians on the faces of a mesh against free ones, as many, of a synthetic scene.
 
-The mesh is fused from the exact depths of the training views, or from those of a model that was trained without it. A
-free arm starts from the Gaussians of the arm before it, and trains means, rotations and scales as 3DGS does. How far
-centres lie from the surface, in the median, is measured to the points that the views show: that much of a scene stays
-behind when its mesh is moved.
+The paper is GaMeS, arXiv 2402.01459. The mesh is fused from the exact depths of the training views, or from those of a
+model that was trained without it. A free arm starts from the Gaussians of the arm before it, and trains means,
+rotations and scales as 3DGS does. How far centres lie from the surface, in the median, is measured to the points that
+the views show: that much of a scene stays behind when its mesh is moved.
 """
 
 import argparse
@@ -147,11 +147,12 @@ def draw(records: list[dict[str, Any]], arms: list[str]) -> Figure:
     return figure
 
 
-COUNTS = declare(
-    "counts",
-    "Gaussians on the faces of the exact mesh against free ones, at equal counts",
-    run,
-    argument("scene", metavar="SCENE", help="a synthetic one, such as room"),
-    *(OUT, iterations(2000), seeds(3)),
+CLAIMS = (
+    declare(
+        "counts",
+        "Gaussians on the faces of the exact mesh against free ones, at equal counts",
+        run,
+        argument("scene", metavar="SCENE", help="a synthetic one, such as room"),
+        *(OUT, iterations(2000), seeds(3)),
+    ),
 )
-CLAIMS = (COUNTS,)

@@ -1,9 +1,9 @@
-"""The studies ``gaustudio/sky``, with and without a background, and ``gaustudio/swaps``, one stage at a time.
+"""Claims ``gaustudio/sky``, with and without a background, and ``gaustudio/swaps``, one stage at a time.
 
-Both train each arm with every seed and measure on the test views, within the masks of the sky and outside of them:
-PSNR, and the opacity of the scene without its background, which should be 0 in the sky and 1 elsewhere. Masks are the
-ray tracer's for a synthetic scene, else those of ``--masks`` or of ``sky_mask=by_color``. Two pixels along their edges
-are left out, because a pixel of an edge shows both.
+The paper is GauStudio, arXiv 2403.19632. Both train each arm with every seed and measure on the test views, within the
+masks of the sky and outside of them: PSNR, and the opacity of the scene without its background, which should be 0 in
+the sky and 1 elsewhere. Masks are the ray tracer's for a synthetic scene, else those of ``--masks`` or of
+``sky_mask=by_color``. Two pixels along their edges are left out, because a pixel of an edge shows both.
 """
 
 import argparse
@@ -211,33 +211,33 @@ def draw(records: list[dict[str, Any]], arms: Iterable[str]) -> Figure:
 
 _MASKS = argument("--masks", metavar="DIR", help="masks of the sky, NAME.png each (default: by colour)")
 _COMMON = (SCENE, RESUMED_OUT, downscale(), iterations(2000), SEEDS, _MASKS)
-SKY = declare(
-    "sky",
-    "opacity in the sky with backgrounds and a loss, and without",
-    run_sky,
-    *_COMMON,
-    argument(
-        "--arms",
-        type=NAMES,
-        default=("without", "ball", "ball+loss", "harmonics+loss", "map+loss"),
-        metavar="A,B",
-        help="of without, loss, ball, ball+loss, harmonics+loss, map+loss (default: all but loss)",
-    ),
-)
-SWAPS = declare(
-    "swaps",
-    "exchange one stage at a time",
-    run_swaps,
-    *_COMMON,
-    argument(
-        "--stages",
-        type=NAMES,
-        default=("initialiser", "representation", "background", "photo_loss", "density"),
-        metavar="S,T",
-        help="which stages (default: all of initialiser, representation, background, photo_loss, density)",
-    ),
-)
+
+
 CLAIMS = (
-    SKY,
-    SWAPS,
+    declare(
+        "sky",
+        "opacity in the sky with backgrounds and a loss, and without",
+        run_sky,
+        *_COMMON,
+        argument(
+            "--arms",
+            type=NAMES,
+            default=("without", "ball", "ball+loss", "harmonics+loss", "map+loss"),
+            metavar="A,B",
+            help="of without, loss, ball, ball+loss, harmonics+loss, map+loss (default: all but loss)",
+        ),
+    ),
+    declare(
+        "swaps",
+        "exchange one stage at a time",
+        run_swaps,
+        *_COMMON,
+        argument(
+            "--stages",
+            type=NAMES,
+            default=("initialiser", "representation", "background", "photo_loss", "density"),
+            metavar="S,T",
+            help="which stages (default: all of initialiser, representation, background, photo_loss, density)",
+        ),
+    ),
 )

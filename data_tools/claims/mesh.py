@@ -1,8 +1,8 @@
-"""The study ``mesh``: meshes of synthetic scenes against the exact surface, over recipes, depths and sizes of voxels.
+"""Claim ``mesh``: meshes of synthetic scenes against the exact surface, over recipes, depths and sizes of voxels.
 
-The truth are the points that the ray tracer finds in the pixels of all views, so that what no view shows does not
-count. Distances are those of :mod:`data_tools.claims.kit.mesh_distances`, with a tau of ``TAU``. Each scene has
-the size of its default, and the same cameras are trained on and fused.
+The claim is ours. The truth are the points that the ray tracer finds in the pixels of all views, so that what no view
+shows does not count. Distances are those of :mod:`data_tools.claims.kit.mesh_distances`, with a tau of ``TAU``. Each
+scene has the size of its default, and the same cameras are trained on and fused.
 """
 
 import argparse
@@ -148,21 +148,22 @@ def draw(records: list[dict[str, Any]], recipes: tuple[str, ...]) -> Figure:
     return figure
 
 
-MESH = declare(
-    "mesh",
-    "meshes of runs against the exact surface of a synthetic scene",
-    run,
-    SYNTHETIC_SCENE,
-    RESUMED_OUT,
-    argument(
-        "--recipes",
-        type=NAMES,
-        default=("3dgs-accel", "mini-splatting2", "adaptive", "surfels"),
-        metavar="R,Q",
-        help="names as in train --recipe; R+NAME=VALUE changes a setting (default"
-        " 3dgs-accel,mini-splatting2,adaptive,surfels)",
+CLAIMS = (
+    declare(
+        "mesh",
+        "meshes of runs against the exact surface of a synthetic scene",
+        run,
+        SYNTHETIC_SCENE,
+        RESUMED_OUT,
+        argument(
+            "--recipes",
+            type=NAMES,
+            default=("3dgs-accel", "mini-splatting2", "adaptive", "surfels"),
+            metavar="R,Q",
+            help="names as in train --recipe; R+NAME=VALUE changes a setting (default"
+            " 3dgs-accel,mini-splatting2,adaptive,surfels)",
+        ),
+        iterations(2000),
+        SEEDS,
     ),
-    iterations(2000),
-    SEEDS,
 )
-CLAIMS = (MESH,)

@@ -1,7 +1,7 @@
-"""The study ``multi-scale/downscale``: a trained scene in smaller and smaller images.
+"""Claim ``multi-scale/downscale`` (Multi-Scale 3DGS, arXiv 2311.17089): a trained scene in smaller and smaller images.
 
 The truth at 1/n of the size is the mean over blocks of n x n pixels of the held-out photographs. Beside the error the
-study counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended. Levels are
+claim counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended. Levels are
 compared with the compensation of opacities, on the same Gaussians and on those of a training with it.
 """
 
@@ -99,7 +99,7 @@ def figures(variant: Variant, scene: Scene, n: int) -> Figures:
 
 
 class Measured(NamedTuple):
-    """The results of the study."""
+    """The results."""
 
     blocks: list[int]
     figures: dict[str, list[list[Figures]]]
@@ -171,10 +171,11 @@ def draw(found: Measured) -> Figure:
     return figure
 
 
-DOWNSCALE = declare(
-    "downscale",
-    "a trained scene in smaller images, with and without levels",
-    run,
-    *(scene("room"), OUT, downscale(), iterations(1000, minimum=10), seeds(2)),
+CLAIMS = (
+    declare(
+        "downscale",
+        "a trained scene in smaller images, with and without levels",
+        run,
+        *(scene("room"), OUT, downscale(), iterations(1000, minimum=10), seeds(2)),
+    ),
 )
-CLAIMS = (DOWNSCALE,)

@@ -1,4 +1,4 @@
-"""The random Gaussians, cameras and measurements of the studies."""
+"""Claims of StopThePop (arXiv 2402.00525) and Optimal Projection (arXiv 2402.00752): order and footprints."""
 
 import argparse
 from pathlib import Path
@@ -263,28 +263,20 @@ def _cloud(n: int) -> tuple[Argument, ...]:
     return (OUT, number("--gaussians", n, "number of Gaussians"), seed("of the Gaussians"))
 
 
-ROTATION = declare(
-    "rotation",
-    "colours of fixed rays while the camera turns and moves",
-    run_rotation,
-    *(*_cloud(100), number("--steps", 80, "steps of the yaw")),
-)
-PROJECTION = declare(
-    "projection",
-    "footprints against the peak along rays, off the axis",
-    run_projection,
-    *_cloud(20),
-)
-ORDER = declare(
-    "order",
-    "hits out of order in a list and in buffers",
-    run_order,
-    *_cloud(300),
-    argument("--ply", type=Path, metavar="FILE", help="use the PLY of a run, seen by its first test camera"),
-    number("--every", 4, "N-th pixels along both axes"),
-)
 CLAIMS = (
-    ROTATION,
-    PROJECTION,
-    ORDER,
+    declare(
+        "rotation",
+        "colours of fixed rays while the camera turns and moves",
+        run_rotation,
+        *(*_cloud(100), number("--steps", 80, "steps of the yaw")),
+    ),
+    declare("projection", "footprints against the peak along rays, off the axis", run_projection, *_cloud(20)),
+    declare(
+        "order",
+        "hits out of order in a list and in buffers",
+        run_order,
+        *_cloud(300),
+        argument("--ply", type=Path, metavar="FILE", help="use the PLY of a run, seen by its first test camera"),
+        number("--every", 4, "N-th pixels along both axes"),
+    ),
 )

@@ -1,9 +1,9 @@
 """Poses: rotate and shift every camera by a known amount, which the training has to correct.
 
-A synthetic scene is trained three times: with its true cameras, with the disturbed ones, and with these and pose
-refinement. Poses are determined up to one similarity transform ``x_true = s S x + d`` that scene and cameras share, so
-it is fitted to the camera centres before anything is compared, and its inverse maps held-out cameras into the trained
-scene.
+The claim is ours. A synthetic scene is trained three times: with its true cameras, with the disturbed ones, and with
+these and pose refinement. Poses are determined up to one similarity transform ``x_true = s S x + d`` that scene and
+cameras share, so it is fitted to the camera centres before anything is compared, and its inverse maps held-out cameras
+into the trained scene.
 
 A rotation of the camera and a shift across its axis move an image nearly alike, and only differences of depth
 distinguish them: errors of both may remain that compensate each other in the image. So there is a third measure besides
@@ -191,12 +191,17 @@ def draw(result: dict[str, dict[str, Any]]) -> Figure:
     return figure
 
 
-POSE = declare(
-    "pose",
-    "pose refinement: cameras moved by known amounts, and recovered",
-    run,
-    *CALIBRATION,
-    argument("--degrees", type=float, default=0.5, metavar="A", help="by which each camera is turned (default 0.5)"),
-    argument("--shift", type=float, default=0.005, metavar="F", help="of the extent, of each camera (default 0.005)"),
+CLAIMS = (
+    declare(
+        "pose",
+        "pose refinement: cameras moved by known amounts, and recovered",
+        run,
+        *CALIBRATION,
+        argument(
+            "--degrees", type=float, default=0.5, metavar="A", help="by which each camera is turned (default 0.5)"
+        ),
+        argument(
+            "--shift", type=float, default=0.005, metavar="F", help="of the extent, of each camera (default 0.005)"
+        ),
+    ),
 )
-CLAIMS = (POSE,)

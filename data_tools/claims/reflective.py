@@ -1,4 +1,4 @@
-"""The study ``reflective/mirrors``: what a mirror needs, on spheres whose every pixel is known.
+"""Claim ``reflective/mirrors`` (arXiv 2412.19282): what a mirror needs, on spheres whose every pixel is known.
 
 A metal sphere of surfels stands in an environment with a lamp and stripes. Its truth is shaded where the pixel's ray
 meets the sphere. Beside shading per pixel and per surfel, each surfel gets the spherical harmonics of degree 3 that fit
@@ -152,7 +152,7 @@ def metal_of(gaussians: Gaussians, metallic: Floats | float = INFINITE, albedo: 
 
 
 def model_of(surfels: ReflectiveSurfels, stage: int, log_environment: Floats | None = None) -> Model:
-    """Return a model in the environment of the study, or in another."""
+    """Return a model in the environment of the claim, or in another."""
     shared = np.log(environment()) if log_environment is None else log_environment
     return Model(surfels, {ENVIRONMENT: shared, STAGE: np.full(1, float(stage))})
 
@@ -294,10 +294,4 @@ def draw(truth: Truth, shown: dict[str, Floats]) -> Figure:
     return figure
 
 
-MIRRORS = declare(
-    "mirrors",
-    "what a mirror needs: shading per pixel, light, occlusion",
-    run,
-    *(OUT, seeds(3)),
-)
-CLAIMS = (MIRRORS,)
+CLAIMS = (declare("mirrors", "what a mirror needs: shading per pixel, light, occlusion", run, *(OUT, seeds(3))),)

@@ -1,11 +1,11 @@
 """Simplification at equal counts: sampling by importance against pruning by rank or mass, merging, and least change.
 
-A dense population is trained once, or read from a PLY. Each choice reduces it to the same numbers of Gaussians, and all
-are then fine-tuned for the same number of iterations, without any event. A seed determines the samples and the order of
-views. Gaussians that dominate no pixel are no candidates, whatever the choice. Pruning by mass keeps the same as rank
-and only determines the number by itself; so its number is one of those that are measured, and both share one line. The
-choices weigh by importance (equation 12 of Mini-Splatting) but for the last, which keeps those without which the
-images would change most (:mod:`minisplat_ref.strategy.removal`).
+The paper is Mini-Splatting, arXiv 2403.14166. A dense population is trained once, or read from a PLY. Each choice
+reduces it to the same numbers of Gaussians, and all are then fine-tuned for the same number of iterations, without any
+event. A seed determines the samples and the order of views. Gaussians that dominate no pixel are no candidates,
+whatever the choice. Pruning by mass keeps the same as rank and only determines the number by itself; so its number is
+one of those that are measured, and both share one line. The choices weigh by importance (equation 12 of Mini-Splatting)
+but for the last, which keeps those without which the images would change most (:mod:`minisplat_ref.strategy.removal`).
 
 Chamfer distances are those of the centres that are kept, before fine-tuning: the mean distance to the nearest point of
 a cloud, and the mean distance from the cloud's points to the nearest centre, added. The clouds are the dense
@@ -212,26 +212,29 @@ def draw(result: dict[str, Any]) -> Figure:
     return figure
 
 
-SIMPLIFY = declare(
-    "simplify",
-    "quality against count: sampling, rank and mass, merging",
-    run,
-    SCENE,
-    OUT,
-    downscale(),
-    iterations(3000),
-    recipe("mini-splatting-d", "of the dense population"),
-    PLY,
-    argument(
-        "--fractions",
-        type=list_of(fraction),
-        default=(0.05, 0.1, 0.2, 0.4),
-        metavar="F,G",
-        help="of the candidates to keep (default 0.05,0.1,0.2,0.4)",
+CLAIMS = (
+    declare(
+        "simplify",
+        "quality against count: sampling, rank and mass, merging",
+        run,
+        SCENE,
+        OUT,
+        downscale(),
+        iterations(3000),
+        recipe("mini-splatting-d", "of the dense population"),
+        PLY,
+        argument(
+            "--fractions",
+            type=list_of(fraction),
+            default=(0.05, 0.1, 0.2, 0.4),
+            metavar="F,G",
+            help="of the candidates to keep (default 0.05,0.1,0.2,0.4)",
+        ),
+        fine_tune(500),
+        argument(
+            "--restart", action="store_true", help="fine-tune from centres and colours alone, as mini-splatting does"
+        ),
+        SEEDS,
+        description="Simplify a dense population in several ways to equal numbers, and fine-tune what is left.",
     ),
-    fine_tune(500),
-    argument("--restart", action="store_true", help="fine-tune from centres and colours alone, as mini-splatting does"),
-    SEEDS,
-    description="Simplify a dense population in several ways to equal numbers, and fine-tune what is left.",
 )
-CLAIMS = (SIMPLIFY,)

@@ -1,4 +1,4 @@
-"""The study ``style/swatches``: two patterns on the synthetic room, with splitting and without.
+"""Claim ``style/swatches`` (G-Style, arXiv 2408.15695): two patterns on the synthetic room, with splitting and without.
 
 How near the features of held-out views are to those of the style is measured by their sliced Wasserstein distance, the
 mean over random directions of the distance between the quantiles of what both have along it. Whether views agree is
@@ -163,13 +163,14 @@ def draw(pictures: dict[str, Floats]) -> Figure:
     return figure
 
 
-SWATCHES = declare(
-    "swatches",
-    "two patterns on a room: features, splitting, and whether views agree",
-    run,
-    RESUMED_OUT,
-    number("--training", 1000, "iterations of the training"),
-    iterations(500, "of each stage of the styling"),
-    seeds(3),
+CLAIMS = (
+    declare(
+        "swatches",
+        "two patterns on a room: features, splitting, and whether views agree",
+        run,
+        RESUMED_OUT,
+        number("--training", 1000, "iterations of the training"),
+        iterations(500, "of each stage of the styling"),
+        seeds(3),
+    ),
 )
-CLAIMS = (SWATCHES,)

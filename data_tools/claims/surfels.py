@@ -1,8 +1,8 @@
-"""The study ``surfels/losses``: what the two losses do to depths, normals and images, beside 3D Gaussians.
+"""Claim ``surfels/losses``: what the two losses do to depths, normals and images, beside 3D Gaussians.
 
-A synthetic scene is trained by ``3dgs-accel`` and by ``surfels`` without the losses, with each, and with both. On test
-views the expected depth is compared with the ray tracer's where the image is opaque, and the normals of the surface
-through it with the true ones.
+The paper is 2DGS, arXiv 2403.17888. A synthetic scene is trained by ``3dgs-accel`` and by ``surfels`` without the
+losses, with each, and with both. On test views the expected depth is compared with the ray tracer's where the image is
+opaque, and the normals of the surface through it with the true ones.
 """
 
 import argparse
@@ -99,10 +99,11 @@ def draw(records: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-LOSSES = declare(
-    "losses",
-    "what the losses of surfels do to depths, normals and images",
-    run,
-    *(synthetic_scene(), OUT, iterations(2000), seeds(3)),
+CLAIMS = (
+    declare(
+        "losses",
+        "what the losses of surfels do to depths, normals and images",
+        run,
+        *(synthetic_scene(), OUT, iterations(2000), seeds(3)),
+    ),
 )
-CLAIMS = (LOSSES,)

@@ -1,4 +1,4 @@
-"""The study ``texture-splat/bricks``: what a texture is worth beside more surfels with as many floats.
+"""Claim ``texture-splat/bricks`` (arXiv 2506.13348): what a texture is worth beside more surfels with as many floats.
 
 A wall of bricks with rounded edges is covered by a grid of round surfels, which stay where they are. Their textures
 are baked from exact maps of albedo and normals in some views, and compared with those of others. Beside textures of
@@ -270,10 +270,6 @@ def draw(records: list[dict[str, Any]], truth: Maps, shown: dict[tuple[str, int]
     return figure
 
 
-BRICKS = declare(
-    "bricks",
-    "a brick wall: more texels beside more surfels, with as many floats",
-    run,
-    *(OUT, seeds(3)),
+CLAIMS = (
+    declare("bricks", "a brick wall: more texels beside more surfels, with as many floats", run, *(OUT, seeds(3))),
 )
-CLAIMS = (BRICKS,)

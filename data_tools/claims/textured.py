@@ -1,4 +1,4 @@
-"""The studies ``textured/counts`` and ``textured/limb``.
+"""Claims ``textured/counts`` and ``textured/limb`` (Textured-GS, arXiv 2407.09733).
 
 ``counts`` measures what textures gain at an equal number of Gaussians, and at an equal number of floats. The Gaussians
 come from a training with Mini-Splatting or from a PLY. They are fine-tuned for the same number of iterations without
@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit import claim as study
+from data_tools.claims.kit import claim
 from data_tools.claims.kit.figures import with_deviation
 from minisplat_ref.extensions.textured.reference import frames, meet
 from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
@@ -137,16 +137,14 @@ def run_limb(args: argparse.Namespace) -> str:
     return f"largest change of a texture from ray to ray across the limb\n\n{table}"
 
 
-COUNTS = study.declare(
-    "counts",
-    "textures at equal numbers of Gaussians, and of floats",
-    run,
-    *study.trainings(1000, "mini-splatting"),
-    study.fine_tune(500),
-    study.argument("--frozen", action="store_true", help="train no positions and shapes"),
-)
-LIMB = study.declare("limb", "whether a texture jumps where rays begin to miss", run_limb)
 CLAIMS = (
-    COUNTS,
-    LIMB,
+    claim.declare(
+        "counts",
+        "textures at equal numbers of Gaussians, and of floats",
+        run,
+        *claim.trainings(1000, "mini-splatting"),
+        claim.fine_tune(500),
+        claim.argument("--frozen", action="store_true", help="train no positions and shapes"),
+    ),
+    claim.declare("limb", "whether a texture jumps where rays begin to miss", run_limb),
 )

@@ -3,7 +3,7 @@
 A mechanism is removed by a setting or by leaving out its event; everything else, including all dates, stays. A row
 about a mechanism that never acts would be meaningless. So there is none if it has no date at this length, or did not
 fire in the full training according to its record of events: small photographs, for example, are never halved. Nor is
-there one if the training without it is the full training to the last digit: it fired, but did nothing. The study
+there one if the training without it is the full training to the last digit: it fired, but did nothing. The claim
 can do the same for our own deviations from the published method (``docs/FIDELITY.md``).
 
 Trainings take long. Each writes its record to ``runs.jsonl`` as soon as it ends, and the same command with the same

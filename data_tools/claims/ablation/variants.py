@@ -1,7 +1,7 @@
 """Recipes with one change: without one mechanism, or with a published rule in place of ours.
 
 Each change is a function of a published recipe, and returns a recipe that it does not concern unchanged.
-:func:`variants_of` scales the changed recipes to the length of a study. ``docs/FIDELITY.md`` says why we deviate.
+:func:`variants_of` scales the changed recipes to the length of the trainings. ``docs/FIDELITY.md`` says why we deviate.
 """
 
 import math

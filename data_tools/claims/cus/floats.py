@@ -1,4 +1,4 @@
-"""The study ``cus/floats``: floats and error of features from anchors, and of a query for each Gaussian.
+"""Claim ``cus/floats`` (arXiv 2511.17904): floats and error of features from anchors, and of a query for each Gaussian.
 
 The photographs of the *room* get feature maps that a teacher makes of the exact ids of its objects: a random direction
 for each label, and texture, a random projection of the classical features. Anchors train with these maps and latents

@@ -1,9 +1,10 @@
-"""The study ``cuts/edge``: a real edge, in a window of a photograph, by few Gaussians with no, one and two curves each.
+"""Claim ``cuts/edge``: a real edge, in a window of a photograph, by few Gaussians with no, one and two curves each.
 
-The window of 48 x 48 pixels is the one whose gradients agree best on a direction: the difference of the eigenvalues of
-their structure tensor is the largest. So it has a strong edge, and little besides; how sharp it is, is up to the lens.
-The band around it is what is within 1.5 pixels of a gradient of at least half the largest. The Gaussians' number stays,
-and their colours do not depend on the view; numbers of Gaussians are chosen so that those of floats are alike.
+The paper is DisC-GS, arXiv 2405.15196. The window of 48 x 48 pixels is the one whose gradients agree best on a
+direction: the difference of the eigenvalues of their structure tensor is the largest. So it has a strong edge, and
+little besides; how sharp it is, is up to the lens. The band around it is what is within 1.5 pixels of a gradient of at
+least half the largest. The Gaussians' number stays, and their colours do not depend on the view; numbers of Gaussians
+are chosen so that those of floats are alike.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The study ``cuts/card`` measures what cuts gain where an image has a sharp edge.
+"""Claim ``cuts/card`` (DisC-GS, arXiv 2405.15196) measures what cuts gain where an image has a sharp edge.
 
 There are two images of 48 x 48 pixels: a Gaussian with a part cut away, which one Gaussian with a cut can reproduce,
 and a card of one brightness with a curved edge, which none can. Few Gaussians are trained on each from random

@@ -1,4 +1,4 @@
-"""The work of the study ``fans/refit``: what a trained scene loses as a mesh, and what refitting gives back."""
+"""The work of ``fans/refit``: what a trained scene loses as a mesh, and what refitting gives back."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The studies ``fans/profile`` and ``fans/refit``.
+"""Claims ``fans/profile`` and ``fans/refit`` (MeshSplats, arXiv 2502.07754).
 
 ``profile``: which reach and rim approximate a Gaussian best seen from the front, for each number of sides; and what
 becomes of a disc and of a ball that turn away from the camera.

@@ -1,4 +1,4 @@
-"""The study ``gdgs/counts``: detail at an equal number of Gaussians, for GDGS beside 3DGS.
+"""Claim ``gdgs/counts`` (GDGS, arXiv 2507.00363): detail at an equal number of Gaussians, for GDGS beside 3DGS.
 
 On photographs GDGS ends with more Gaussians than 3DGS does, so that one training of each says little. Here both are
 curves over their number, which follows from the threshold of gradients from which on they clone and split.

@@ -1,7 +1,8 @@
-"""The study ``gdgs/sphere``: what each part of GDGS does to noisy points of a sphere, without any photograph.
+"""Claim ``gdgs/sphere``: what each part of GDGS does to noisy points of a sphere, without any photograph.
 
-Points of a unit sphere with noise along all axes become Gaussians: where they are, where the predictor puts them, and
-after steps of gradient descent on the attraction, on it with contraction, and on it with dispersion.
+The paper is GDGS, arXiv 2507.00363. Points of a unit sphere with noise along all axes become Gaussians: where they are,
+where the predictor puts them, and after steps of gradient descent on the attraction, on it with contraction, and on it
+with dispersion.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""What studies are made of: a scene, trainings by seed, records that resume, and the report that is written.
+"""What measures a claim: a scene, trainings by seed, records that resume, and the report that is written.
 
-A study's module measures, draws and returns a :class:`Report`; :func:`carry_out` gives figures their style, and writes
-and prints the report. Trainings take long: with :func:`.records.resume` a study stores the record of each as soon as it
+A claim's module measures, draws and returns a :class:`Report`; :func:`carry_out` gives figures their style, and writes
+and prints the report. Trainings take long: with :func:`.records.resume` a claim stores the record of each as soon as it
 ends, and continues with the missing ones when it is called again with the same folder.
 
 Means over seeds, tables and curves are in :mod:`.figures`. Neither module loads Numba or matplotlib by itself, so that
@@ -25,7 +25,7 @@ from minisplat_ref.datasets.named_scenes import read_scene as read_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.palette import PNG_DPI
 from minisplat_ref.interface.progress import progress_bar
-from minisplat_ref.interface.progress import with_progress as with_progress  # which studies take from here
+from minisplat_ref.interface.progress import with_progress as with_progress  # which claims take from here
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io import load_ply, viewpoints
 from minisplat_ref.io.atomic import making_folder
@@ -44,7 +44,7 @@ REMEDY = "give more iterations, larger photographs or another scene, with which 
 
 
 class Report(NamedTuple):
-    """What a study has found."""
+    """What has been measured."""
 
     result: Mapping[str, Any]
     """For ``result.json``."""
@@ -65,8 +65,8 @@ def carry_out(measure: Callable[[argparse.Namespace], Any], args: argparse.Names
         Returns a :class:`Report`, or only its text if there is no ``--out``.
     args : Namespace
     is_resumed : bool
-        The folder may be there, with the records of an earlier call; otherwise it is new, and not there if the study
-        fails.
+        The folder may be there, with the records of an earlier call; otherwise it is new, and not there if the
+        measurement fails.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def settings_of(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def seeds_of(args: argparse.Namespace) -> str:
-    """Return the seeds of a study that names each of them."""
+    """Return the seeds of a claim that names each of them."""
     return f"seeds {', '.join(map(str, args.seeds))}"
 
 

@@ -1,4 +1,4 @@
-"""Conditions under which studies train a scene: as it is, with few photographs, and with a known defect.
+"""Conditions under which claims train a scene: as it is, with few photographs, and with a known defect.
 
 A disturbance is the same for every recipe and seed, so that trainings under one condition differ in nothing else.
 (:mod:`.defects` plants another one in every trial.) Test views stay as they are but under ``sky``.

@@ -1,7 +1,7 @@
-"""Curves of quality over the number of Gaussians, for studies that compare methods at an equal number.
+"""Curves of quality over the number of Gaussians, for claims that compare methods at an equal number.
 
 A curve is a recipe whose number of Gaussians follows from some setting: a threshold of densification, a penalty. Each
-of its points is trained with every seed, and a study that was interrupted continues.
+of its points is trained with every seed, and a measurement that was interrupted continues.
 """
 
 import argparse

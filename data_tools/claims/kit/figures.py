@@ -1,4 +1,4 @@
-"""Figures of studies, in both senses: means and deviations over seeds, as text, as tables and as curves."""
+"""Figures of claims, in both senses: means and deviations over seeds, as text, as tables and as curves."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any

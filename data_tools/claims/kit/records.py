@@ -1,4 +1,4 @@
-"""What a study has measured so far, one record for each job, so that it continues where it was interrupted.
+"""What a claim has measured so far, one record for each job, so that it continues where it was interrupted.
 
 A job is a training, or a few, with the measurements of what comes out. Jobs are carried out here one after the other;
 or :data:`HAND_OUT` says who carries them out, each in a process of its own, which is the same command with :data:`JOB`
@@ -34,7 +34,7 @@ class JobDone(BaseException):
 
 @contextmanager
 def handing_out(hand_out: HandOut | None) -> Iterator[None]:
-    """Have the jobs of a study carried out elsewhere; None: here."""
+    """Have the jobs of a claim carried out elsewhere; None: here."""
     token = HAND_OUT.set(hand_out)
     try:
         yield
@@ -44,7 +44,7 @@ def handing_out(hand_out: HandOut | None) -> Iterator[None]:
 
 @contextmanager
 def one_job(number: int) -> Iterator[None]:
-    """Carry out one job of a study, and end when it is done."""
+    """Carry out one job of a claim, and end when it is done."""
     token = JOB.set(number)
     try:
         yield
@@ -184,7 +184,7 @@ def _read_records(folder: Path, settings: Mapping[str, Any], nouns: str) -> list
         path.write_text(json.dumps(settings) + "\n", encoding="utf-8")
         return []
     if not path.is_file():
-        raise InputError(f"{folder} exists and is not of this study: give another --out")
+        raise InputError(f"{folder} exists and is not of this claim: give another --out")
     first, *lines = path.read_text(encoding="utf-8").splitlines()
     if json.loads(first) != settings:
         raise InputError(f"{folder} holds {nouns} of {first}: give another --out, or the same settings")

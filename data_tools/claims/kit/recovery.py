@@ -1,4 +1,4 @@
-"""What the studies of exposures and of poses share: three trainings of a synthetic scene, with a known disturbance."""
+"""What the claims about exposures and poses share: three trainings of a synthetic scene, with a known disturbance."""
 
 import argparse
 from typing import Any

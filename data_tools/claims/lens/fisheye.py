@@ -1,9 +1,9 @@
-"""The study ``lens/fisheye``: a fisheye of 150 degrees trained as photographed, against undistorting and cropping it.
+"""Claim ``lens/fisheye``: a fisheye of 150 degrees trained as photographed, against undistorting and cropping it.
 
-The photographs are ray-traced in a closed room along an equidistant fisheye's rays. COLMAP's undistortion keeps a
-pinhole image of the same focal length; the pixels whose rays leave it are the border. The arms start from the same
-points, seen by the fisheye, so the undistorted ones are told of places that their photographs do not show, and none
-changes the number of Gaussians:
+The paper is 3DGUT, arXiv 2412.12507. The photographs are ray-traced in a closed room along an equidistant fisheye's
+rays. COLMAP's undistortion keeps a pinhole image of the same focal length; the pixels whose rays leave it are the
+border. The arms start from the same points, seen by the fisheye, so the undistorted ones are told of places that their
+photographs do not show, and none changes the number of Gaussians:
 
 - ``as photographed``: exact rays, on the fisheye's photographs;
 - ``undistorted, exact rays``: the same renderer on the pinhole's, so that the photographs alone make the difference;

@@ -1,4 +1,4 @@
-"""The study ``lens/footprints``: footprints of three kinds against the peak along the ray, off the axis.
+"""Claim ``lens/footprints`` (arXiv 2412.12507): footprints of three kinds against the peak along the ray, off the axis.
 
 Random Gaussians at distance 1 are turned away from the axis of a pinhole and of an equidistant fisheye. The truth in a
 pixel is the maximum of the Gaussian along its ray. EWA is the conic of the first-order expansion of the lens at the

@@ -1,4 +1,4 @@
-"""A body that turns and grows, photographed while it does: the scene of both studies, known exactly."""
+"""A body that turns and grows, photographed while it does: the scene of both claims, known exactly."""
 
 from typing import NamedTuple
 

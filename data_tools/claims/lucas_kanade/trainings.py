@@ -1,4 +1,6 @@
-"""The studies ``lucas-kanade/forms`` and ``lucas-kanade/body``: velocities that agree, and what the flow loss does.
+"""Claims ``lucas-kanade/forms`` and ``lucas-kanade/body``: velocities that agree, and what the flow loss does.
+
+The paper is Gaussian Splatting Lucas-Kanade, arXiv 2407.11309.
 
 *forms*: a warp is fitted to the motion of a body that turns and grows, and the three forms of its velocity are
 compared, with the backward warp by Newton's method and its derivatives by differences; so is what Runge-Kutta makes of

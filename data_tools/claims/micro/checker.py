@@ -1,4 +1,4 @@
-"""The study ``micro/checker``: a test chart that is half a fine checkerboard and half a smooth ramp.
+"""Claim ``micro/checker`` (arXiv 2504.05740): a test chart that is half a fine checkerboard and half a smooth ramp.
 
 Several cameras look straight at the chart. Every variant starts from the same points and gets the same number of new
 Gaussians at each densification, from those with the largest scaled gradients. So all end with the same count, and

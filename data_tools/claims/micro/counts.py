@@ -1,7 +1,8 @@
-"""The study ``micro/counts``: whether Micro-splatting needs fewer Gaussians than 3DGS, and what its second stage gains.
+"""Claim ``micro/counts``: whether Micro-splatting needs fewer Gaussians than 3DGS, and what its second stage gains.
 
-Three curves of PSNR over the number of Gaussians. That of ``3dgs-accel`` is drawn by its threshold of densification;
-those of ``micro``, with its second stage and without, by their penalty of size, of which more makes more Gaussians.
+The paper is Micro-splatting, arXiv 2504.05740. Three curves of PSNR over the number of Gaussians. That of
+``3dgs-accel`` is drawn by its threshold of densification; those of ``micro``, with its second stage and without, by
+their penalty of size, of which more makes more Gaussians.
 """
 
 import argparse

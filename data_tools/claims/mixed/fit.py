@@ -1,4 +1,4 @@
-"""Fitting an image by few primitives of one kind, in the plane: what studies and notebooks play with.
+"""Fitting an image by few primitives of one kind, in the plane: what claims and notebooks play with.
 
 All lie in one plane that faces the camera, are white or gray and equally bright from everywhere. They begin at random
 places as small ellipses, lines or triangles, and are trained by 3DGS's rates; their number and kind stay.

@@ -1,4 +1,4 @@
-"""The study ``mixed/scene`` compares populations of as many floats on scenes.
+"""Claim ``mixed/scene`` (MP-GS, arXiv 2507.11321) compares populations of as many floats on scenes.
 
 Points of a scene become ellipses, lines and triangles by groups. 3DGS gets as many floats, by leaving points out at
 random; and, for comparison, all of the points, and one Gaussian for each group, which tells what vertices are worth

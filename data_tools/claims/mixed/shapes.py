@@ -1,4 +1,4 @@
-"""The studies ``mixed/shapes`` and ``mixed/letter`` ask what lines and triangles are worth in an image.
+"""Claims ``mixed/shapes`` and ``mixed/letter`` (arXiv 2507.11321) ask what lines and triangles are worth in an image.
 
 Few primitives of one kind are trained on images of 48 x 48 pixels, from random places; their number stays.
 

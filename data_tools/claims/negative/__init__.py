@@ -1,4 +1,4 @@
-"""Claims of ``negative``, measured."""
+"""Claims of ``negative`` (NegGS, arXiv 2405.18163), measured."""
 
 from data_tools.claims.kit.claim import OUT, declare, number, seed, seeds
 from data_tools.claims.negative import backdrop, rings

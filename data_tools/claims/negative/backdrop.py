@@ -1,4 +1,4 @@
-"""The study ``negative/backdrop``: what a negative colour does, and does not do, in compositing.
+"""Claim ``negative/backdrop`` (NegGS, arXiv 2405.18163): what a negative colour does, and does not do, in compositing.
 
 A wide Gaussian and a smaller one in front of it are fitted to the image of an opaque ring, with colours clamped at
 zero as in 3DGS and with colours of either sign; four clamped Gaussians side by side are the alternative. Behind the

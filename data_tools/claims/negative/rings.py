@@ -1,8 +1,8 @@
-"""The study ``negative/rings``: differences of two Gaussians against sums of positive ones, without compositing.
+"""Claim ``negative/rings``: differences of two Gaussians against sums of positive ones, without compositing.
 
-This is the setting of the paper's argument. In a plane, ``f(x) = sum_k s_k w_k exp(-|L_k (x - m_k)|^2 / 2)`` has given
-signs s_k, and everything else is fitted to the image of a ring by least squares. The fit is not convex, so it starts
-several times, and the best result counts.
+The paper is NegGS, arXiv 2405.18163. This is the setting of the paper's argument. In a plane, ``f(x) = sum_k s_k w_k
+exp(-|L_k (x - m_k)|^2 / 2)`` has given signs s_k, and everything else is fitted to the image of a ring by least
+squares. The fit is not convex, so it starts several times, and the best result counts.
 
 The quality of a pair depends on the allowed heights of its two Gaussians. The best pair of all consists of two huge
 ones that almost cancel, the derivative of a Gaussian with respect to its width; so the pair is fitted with two bounds

@@ -1,4 +1,4 @@
-"""The study ``omg/distinctiveness``: which Gaussians of a scene to keep, and what they cost as a file.
+"""Claim ``omg/distinctiveness`` (arXiv 2503.16924): which Gaussians of a scene to keep, and what they cost as a file.
 
 The Gaussians come from a training with Mini-Splatting2 or from a PLY. Of those that dominate a pixel, equally many are
 kept by importance alone and by importance times distinctiveness squared; both selections are fine-tuned for the same
@@ -6,7 +6,7 @@ number of iterations, without any event. Then each is written as ``.omg`` and re
 field by itself is taken from such a file at every level, which shows where the quality is lost.
 
 Distinctiveness hurts flat regions, because these consist of Gaussians whose neighbours have the same colour. So the
-study measures the flatter half of each test photograph and the rest apart (:mod:`data_tools.claims.kit.detail`).
+claim measures the flatter half of each test photograph and the rest apart (:mod:`data_tools.claims.kit.detail`).
 """
 
 import argparse
@@ -39,7 +39,7 @@ COLORS = dict(zip(CHOICES, (BLUE, RED), strict=True))
 
 
 def run(args: argparse.Namespace) -> kit.Report:
-    """Train, prune, fine-tune and measure; each seed is a record, and a study that was interrupted continues."""
+    """Train, prune, fine-tune and measure; each seed is a record, and a measurement that was interrupted continues."""
     scene = kit.read_scene(args.scene, args.downscale)
     settings = {**kit.describe_scene(scene), **kit.settings_of(args, "recipe", "iterations", "fine_tune")}
     settings |= {"power": POWER} | ({} if args.ply is None else {"ply": str(args.ply)})

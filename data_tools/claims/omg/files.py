@@ -1,7 +1,8 @@
-"""The study ``omg/files``: what the codes and networks of a training cost in bytes and in quality, beside other files.
+"""Claim ``omg/files``: what the codes and networks of a training cost in bytes and in quality, beside other files.
 
-Each training's result is measured as it is, as ``.omg`` of its own codes and networks, and as every file that
-``convert`` can write at every level. All rows of a seed are the same trained Gaussians, read again from the file.
+The paper is Optimized Minimal Gaussians, arXiv 2503.16924. Each training's result is measured as it is, as ``.omg`` of
+its own codes and networks, and as every file that ``convert`` can write at every level. All rows of a seed are the same
+trained Gaussians, read again from the file.
 """
 
 import argparse
@@ -60,7 +61,7 @@ def _rows(model: Model, frame: Frame, scene: Scene) -> Iterator[dict[str, Any]]:
 
     def psnr_of(found: Gaussians) -> float:
         psnr = evaluate(found, scene.test_views, RenderSettings(scene.background)).psnr
-        assert psnr is not None, "a study has test views"
+        assert psnr is not None, "a claim has test views"
         return psnr
 
     whole = psnr_of(gaussians)

@@ -1,4 +1,4 @@
-"""What the study ``polygons/cost`` measures: hits, and time of one processor for a pixel.
+"""Claim ``polygons/cost`` (REdiSplats, arXiv 2503.12284): hits, and time of one processor for a pixel.
 
 The same flat Gaussians are drawn as polygons, as ellipsoids that rays trace, and as splats, by the plain kernels and by
 the tuned ones. Splats are looked at for every pixel of a tile that they may touch; ellipsoids and polygons, where a

@@ -1,4 +1,4 @@
-"""What the study ``polygons/edits`` measures: the way to polygons and back, affine edits, and a sheet that is bent.
+"""Claim ``polygons/edits`` (arXiv 2503.12284): the way to polygons and back, affine edits, and a sheet that is bent.
 
 All in float64. An affine edit of all corners is compared with the Gaussians themselves under the same map,
 ``Sigma' = A Sigma A^T`` refactored by singular values (``mechanisms.editing.deformation``), as covariances and as
@@ -190,7 +190,7 @@ def bend_errors(n: int, angle: float) -> dict[str, float]:
 
 
 def measure(seeds: int) -> dict[str, Any]:
-    """Return all that the study reports, by claim."""
+    """Return all that is reported, by claim."""
     trips = [round_trips(seed) for seed in range(seeds)]
     result: dict[str, Any] = {"round trip": {n: max(trip[n] for trip in trips) for n in SIDES}, "affine": {}}
     for name in kit.with_progress(MAPS, "edits"):

@@ -1,4 +1,4 @@
-"""What the study ``proxies/affine`` measures: how exact edits are, and what bending a sheet of Gaussians costs.
+"""Claim ``proxies/affine`` (arXiv 2402.01459): how exact edits are, and what bending a sheet of Gaussians costs.
 
 Affine edits are compared with the affine map itself, in float64: centres, covariances, colours towards rotated
 directions and, where the map is a similarity, the image with that of a camera which was moved the other way.

@@ -1,4 +1,4 @@
-"""What the study ``proxies/sheet`` measures: a sheet of masses and springs against closed forms.
+"""Claim ``proxies/sheet`` (ours; binding as in arXiv 2402.01459): a sheet of masses and springs against closed forms.
 
 - *Free fall*: nothing is held, and only gravity acts. Every Gaussian bound to the sheet is at ``x + v t + g t^2 / 2``,
   and its shape does not change. Verlet is exact here up to rounding.
@@ -7,9 +7,9 @@
 
       x = a asinh(s / a),   y = a cosh(D / 2a) - sqrt(a^2 + s^2)  below the supports,   2 a sinh(D / 2a) = L
 
-  The study reports the largest distance of a vertex from its place over L, by number of cells and by stretch under the
+  Reported is the largest distance of a vertex from its place over L, by number of cells and by stretch under the
   sheet's own weight.
-- *Energy*: a sheet held at one side swings down without drag, with drag, and onto a floor. The study reports the
+- *Energy*: a sheet held at one side swings down without drag, with drag, and onto a floor. Reported is the
   largest change of the sum of all energies over the largest sum of kinetic and dissipated energy, by the length of the
   step.
 """

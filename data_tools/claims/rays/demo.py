@@ -1,4 +1,4 @@
-"""The scene of the study ``rays/claims``: a ball of 300 Gaussians over a floor of them, a mirror, a lamp.
+"""The scene of ``rays/claims``: a ball of 300 Gaussians over a floor of them, a mirror, a lamp.
 
 Camera frame and world are the same: x right, y down, z forward.
 """

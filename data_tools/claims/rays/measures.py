@@ -1,4 +1,4 @@
-"""The measurements of the studies, one function per claim."""
+"""Measurements of RaySplats (arXiv 2501.19196), one function per claim."""
 
 import argparse
 from functools import partial

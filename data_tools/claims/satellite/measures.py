@@ -1,4 +1,4 @@
-"""The studies ``satellite/boxes``, without each part, and ``satellite/distance``, where affine cameras fail."""
+"""Claims ``satellite/boxes``, by part, and ``satellite/distance``, where affine cameras fail (arXiv 2412.13047)."""
 
 import argparse
 from typing import Any, NamedTuple

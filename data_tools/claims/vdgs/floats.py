@@ -1,4 +1,4 @@
-"""The study ``vdgs/floats``: PSNR at held-out views with as many floats, those of the network included.
+"""Claim ``vdgs/floats`` (arXiv 2312.13729): PSNR at held-out views with as many floats, those of the network included.
 
 Harmonics alone train a Gaussian for each of N points of the scene, drawn at random. Each mode trains as many fewer as
 have the floats of its network and hash grid. Numbers stay, and all of the schedule else is that of the recipe.

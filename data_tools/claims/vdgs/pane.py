@@ -1,4 +1,4 @@
-"""The study ``vdgs/pane``: whether the opacity of a pane comes to follow Schlick's formula.
+"""Claim ``vdgs/pane`` (VDGS, arXiv 2312.13729): whether the opacity of a pane comes to follow Schlick's formula.
 
 A flat pane of white Gaussians stands before a wall of coloured ones. Seen at the angle theta from its normal, each
 Gaussian of the pane has the opacity of Schlick's approximation of Fresnel's reflectance,

@@ -1,4 +1,4 @@
-"""The measurements of the studies ``vr/foveation``, ``vr/queues`` and ``vr/yaw``."""
+"""Measurements of the claims ``vr/foveation``, ``vr/queues`` and ``vr/yaw`` (VRSplat, arXiv 2505.10144)."""
 
 import argparse
 import statistics

@@ -1,4 +1,4 @@
-"""What the study ``wave/claims`` measures: the closed form, focus, occlusion, and what a Gaussian costs.
+"""Claim ``wave/claims`` (arXiv 2505.06582): the closed form, focus, occlusion, and what a Gaussian costs.
 
 *Closed form.* The field of one tilted Gaussian against the brute-force Rayleigh-Sommerfeld sum, beside what sampling
 gives: the image of the Gaussian along z, with its phase of one plane, propagated by the angular spectrum method.

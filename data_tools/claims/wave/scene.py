@@ -1,4 +1,4 @@
-"""What the study ``wave/scene`` measures: holograms of a trained scene against its rendering.
+"""Claim ``wave/scene`` (Gaussian Wave Splatting, arXiv 2505.06582): holograms of a trained scene against its rendering.
 
 *In one plane.* A box thinner than a wavelength has everything in focus. What differs from the rendering by the run's
 own renderer is what flattening, the Jacobian and the windows cost.

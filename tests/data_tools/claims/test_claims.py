@@ -1,4 +1,4 @@
-"""The studies: through the command line with tiny settings, and what their tables say must be what was measured."""
+"""Claims: through the command line with tiny settings, and what their tables say must be what was measured."""
 
 import json
 import re
@@ -23,7 +23,7 @@ TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("studies") / "room"
+    folder = tmp_path_factory.mktemp("claims") / "room"
     assert main(["synthetic", "room", "--out", str(folder), *TINY]) == 0
     return folder
 

@@ -1,4 +1,4 @@
-"""The study of ablations: what each variant lacks, and a study that was interrupted."""
+"""The claim ``ablation``: what each variant lacks, and a measurement that was interrupted."""
 
 import json
 from functools import partial
@@ -229,7 +229,7 @@ def test_bad_input_is_one_line(tmp_path, capsys, small):
     assert not out.exists()
     out.mkdir()
     assert measure_claim(["ablation", "room", "--out", str(out), "--iterations", "60"]) == 2
-    assert "is not of this study" in capsys.readouterr().err
+    assert "is not of this claim" in capsys.readouterr().err
 
 
 def test_settings_that_a_recipe_lacks_change_nothing():

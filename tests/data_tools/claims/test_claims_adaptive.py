@@ -1,4 +1,4 @@
-"""The study of ``adaptive``: its conditions, its rules, its table, and a study that was interrupted."""
+"""The claim ``adaptive``: its conditions, its rules, its table, and a measurement that was interrupted."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Jobs of a study that are carried out elsewhere: records, an interruption, a failure."""
+"""Jobs of a claim that are carried out elsewhere: records, an interruption, a failure."""
 
 import json
 from pathlib import Path
@@ -66,12 +66,12 @@ def test_records_of_other_arguments_are_not_taken_in(tmp_path, in_turn):
 
 
 def test_words_without_workers():
-    words = ["study", "x", "--workers", "2", "room", "--cluster=tcp://h:1", "--out", "o"]
-    assert without_workers(words) == ["study", "x", "room", "--out", "o"]
+    words = ["claims", "x", "--workers", "2", "room", "--cluster=tcp://h:1", "--out", "o"]
+    assert without_workers(words) == ["claims", "x", "room", "--out", "o"]
 
 
 def count_seeds(args):
-    """The study that the command runs below: a record for each seed."""
+    """The claim that the command runs below: a record for each seed."""
     found = resume(args.out, SETTINGS, [{"seed": seed} for seed in args.seeds], lambda seed: [{"value": 2 * seed}])
     return Report({"records": found}, Figure(), f"{found}")
 
@@ -81,7 +81,7 @@ CLAIM = declare("count", "counts", count_seeds, RESUMED_OUT, SEEDS)
 
 @pytest.mark.parametrize("code", [0, 2])
 def test_the_command_hands_out_itself(tmp_path, monkeypatch, capsys, code):
-    """``--workers`` of a study, with commands carried out here in place of workers' processes."""
+    """``--workers`` of a claim, with commands carried out here in place of workers' processes."""
 
     def carry_out_all(workers, jobs, folder, inputs=(), on_done=None):
         assert workers.n == 2

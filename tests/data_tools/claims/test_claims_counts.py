@@ -1,4 +1,4 @@
-"""Curves of quality over the number of Gaussians, and quality where there is detail: by hand, and through a study."""
+"""Curves of quality over the number of Gaussians, and quality where there is detail: by hand, and through a claim."""
 
 import json
 
@@ -93,7 +93,7 @@ def few(monkeypatch):
     monkeypatch.setattr(gdgs_counts, "CURVES", curves)
 
 
-def test_a_study_of_counts_runs_and_continues(few, tmp_path, capsys, monkeypatch):
+def test_curves_of_counts_run_and_continue(few, tmp_path, capsys, monkeypatch):
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *TINY]) == 0
     command = ["gdgs/counts", str(tmp_path / "room"), "--iterations", "30", "--out", str(tmp_path / "s")]
     assert measure_claim([*command, "--seeds", "1"]) == 0

@@ -1,4 +1,4 @@
-"""``study defects``: what is planted is what the record says, and the table counts the records."""
+"""The claim ``defects``: what is planted is what the record says, and the table counts the records."""
 
 import json
 

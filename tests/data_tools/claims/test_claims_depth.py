@@ -1,4 +1,4 @@
-"""The study of depth reinitialisation: through the command line with tiny settings, and its errors on known points."""
+"""The claim ``depth``: through the command line with tiny settings, and its errors on known points."""
 
 import json
 

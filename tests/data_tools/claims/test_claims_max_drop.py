@@ -1,4 +1,4 @@
-"""The study of what ``simplify --max-drop`` promises: through the command line, and its rows, made by hand."""
+"""What ``simplify --max-drop`` promises: through the command line, and its rows, made by hand."""
 
 import json
 
@@ -17,7 +17,7 @@ TINY = ("--views", "12", "--width", "32", "--height", "24", "--supersampling", "
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("study") / "room"
+    folder = tmp_path_factory.mktemp("claim") / "room"
     assert main(["synthetic", "room", "--out", str(folder), *TINY]) == 0
     return folder
 
@@ -25,8 +25,8 @@ def scene_folder(tmp_path_factory):
 def test_study_chooses_and_loses_what_the_command_does(scene_folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("minisplat_ref.app.cli.simplify.FINE_TUNE", 4)
     options = ("--recipe", "3dgs-accel", "--iterations", "60")
-    study = ["max-drop", str(scene_folder), *options, "--fine-tune", "4", "--limits", "0,2", "--seeds", "3"]
-    assert measure_claim([*study, "--out", str(tmp_path / "out")]) == 0
+    words = ["max-drop", str(scene_folder), *options, "--fine-tune", "4", "--limits", "0,2", "--seeds", "3"]
+    assert measure_claim([*words, "--out", str(tmp_path / "out")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     result = json.loads((tmp_path / "out" / RESULT).read_text())
     assert read_image(tmp_path / "out" / FIGURE).std() > 1
@@ -42,7 +42,7 @@ def test_study_chooses_and_loses_what_the_command_does(scene_folder, tmp_path, c
     assert much["drop"] == pytest.approx(decision["chosen"]["drop"], abs=1e-3)
     assert much["lost"] == pytest.approx(decision["test"]["drop"], abs=1e-3)
 
-    again = [*study, "--out", str(tmp_path / "out")]
+    again = [*words, "--out", str(tmp_path / "out")]
     monkeypatch.setattr(max_drop_study, "train_run", None)  # nothing is measured twice
     assert measure_claim(again) == 0
 

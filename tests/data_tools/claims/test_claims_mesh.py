@@ -57,7 +57,7 @@ def test_the_study_measures_meshes(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("data_tools.claims.mesh.VOXELS", (0.1, 0.2))
     monkeypatch.setattr("data_tools.claims.mesh.DEPTH_VOXEL", 0.2)
     monkeypatch.setattr("data_tools.claims.mesh.N_POINTS", 2000)
-    out = tmp_path / "study"
+    out = tmp_path / "claim"
     options = ["--recipes", "3dgs-accel", "--iterations", "150", "--seeds", "0", "--out", str(out)]
     assert measure_claim(["mesh", "room", *options]) == 0
     records = json.loads((out / "result.json").read_text())["records"]

@@ -1,4 +1,4 @@
-"""``study precision``: every training really has the precision that its row names."""
+"""The claim ``precision``: every training really has the precision that its row names."""
 
 import json
 

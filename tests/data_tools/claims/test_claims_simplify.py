@@ -1,4 +1,4 @@
-"""The study of simplification: through the command line with tiny settings, and its parts on cases done by hand."""
+"""The claim ``simplify``: through the command line with tiny settings, and its parts on cases done by hand."""
 
 import json
 
@@ -28,7 +28,7 @@ TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("study") / "room"
+    folder = tmp_path_factory.mktemp("claim") / "room"
     assert main(["synthetic", "room", "--out", str(folder), *TINY]) == 0
     return folder
 
