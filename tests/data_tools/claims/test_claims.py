@@ -142,7 +142,7 @@ def test_bad_input_is_one_line(scene_folder, tmp_path, capsys, arguments, messag
     assert not (tmp_path / "out").exists()
 
 
-def test_interrupted_study_leaves_nothing(tmp_path, capsys, monkeypatch):
+def test_interrupted_claim_leaves_nothing(tmp_path, capsys, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt
 

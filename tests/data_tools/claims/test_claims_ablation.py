@@ -147,7 +147,7 @@ def small(monkeypatch):
     monkeypatch.setattr(named_scenes, "make_scene", lambda name: scene)
 
 
-def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
+def test_measured_and_its_continuation(tmp_path, capsys, small, monkeypatch):
     kept = {name: MECHANISMS[name] for name in ("restart", "sampling")}
     monkeypatch.setattr(ablation, "MECHANISMS", kept)
     out = tmp_path / "out"
@@ -192,7 +192,7 @@ def test_what_has_not_fired_has_no_row(tmp_path, capsys, small, monkeypatch):
     assert set(result["summary"]) == {FULL, names[1]} and result["acts"] == {names[0]: 0, names[1]: 1}
 
 
-def test_a_study_of_what_has_not_fired_is_refused(tmp_path, capsys, small, monkeypatch):
+def test_a_claim_of_what_has_not_fired_is_refused(tmp_path, capsys, small, monkeypatch):
     monkeypatch.setattr(ablation, "MECHANISMS", {"half-size warm-up": MECHANISMS["half-size warm-up"]})
     out = tmp_path / "out"
     command = ["ablation", "room", "--out", str(out), "--recipe", "mini-splatting2"]

@@ -121,7 +121,7 @@ def test_a_rule_can_be_asked_for_by_its_name():
         adaptive._recipes_by_name(["small views"])
 
 
-def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):
+def test_measured_and_its_continuation(tmp_path, capsys, scene, monkeypatch):
     monkeypatch.setattr(named_scenes, "make_scene", lambda name: make_scene("room", **SMALL))
     monkeypatch.setattr(adaptive, "ITERATIONS", 48)
     monkeypatch.setattr(adaptive, "ADAPTIVE", ADAPTIVE._replace(iterations=40))

@@ -36,7 +36,7 @@ def true_points(truth):
     return np.concatenate(points)
 
 
-def test_study(tmp_path, capsys, monkeypatch):
+def test_claim(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(depth_types, "make_scene", small)
     out = tmp_path / "out"
     numbers = ("--iterations", "60", "--seeds", "0,1")

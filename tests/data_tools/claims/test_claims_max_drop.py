@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from data_tools.claims import max_drop as max_drop_study
+from data_tools.claims import max_drop as max_drop_claim
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit.claim import FIGURE, RESULT
 from minisplat_ref.app.cli import main
@@ -22,7 +22,7 @@ def scene_folder(tmp_path_factory):
     return folder
 
 
-def test_study_chooses_and_loses_what_the_command_does(scene_folder, tmp_path, capsys, monkeypatch):
+def test_claim_chooses_and_loses_what_the_command_does(scene_folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("minisplat_ref.app.cli.simplify.FINE_TUNE", 4)
     options = ("--recipe", "3dgs-accel", "--iterations", "60")
     words = ["max-drop", str(scene_folder), *options, "--fine-tune", "4", "--limits", "0,2", "--seeds", "3"]
@@ -43,7 +43,7 @@ def test_study_chooses_and_loses_what_the_command_does(scene_folder, tmp_path, c
     assert much["lost"] == pytest.approx(decision["test"]["drop"], abs=1e-3)
 
     again = [*words, "--out", str(tmp_path / "out")]
-    monkeypatch.setattr(max_drop_study, "train_run", None)  # nothing is measured twice
+    monkeypatch.setattr(max_drop_claim, "train_run", None)  # nothing is measured twice
     assert measure_claim(again) == 0
 
 
@@ -54,12 +54,12 @@ def test_a_row_for_each_limit_and_seed():
         {**record, "seed": 0, "limit": 0.1},
     ]
     records = [{**each, "lost_error": 0.0625} for each in records]
-    heading, rows = max_drop_study.to_table(records)
+    heading, rows = max_drop_claim.to_table(records)
     assert rows == [
         ["0.1", "0", "200", "all", "", "0"],
         ["0.5", "0", "200", "150 (75%)", "0.250 ± 0.125", "0.375 ± 0.062"],
     ]
     assert len(heading) == len(rows[0])
-    assert max_drop_study.to_table([{**records[0], "lost_error": None}])[1][0][-1] == "0.375", "of one test view"
-    (axes,) = max_drop_study.draw(records).axes
+    assert max_drop_claim.to_table([{**records[0], "lost_error": None}])[1][0][-1] == "0.375", "of one test view"
+    (axes,) = max_drop_claim.draw(records).axes
     assert np.allclose(axes.lines[0].get_xydata(), [[0.1, 0], [0.5, 0.375]])

@@ -50,7 +50,7 @@ def test_points_are_drawn_uniformly_by_area(rng):
     assert (drawn.points[is_flat] @ [1 / 3, 1, 0] <= 1 + 1e-12).all()
 
 
-def test_the_study_measures_meshes(tmp_path, capsys, monkeypatch):
+def test_the_claim_measures_meshes(tmp_path, capsys, monkeypatch):
     pytest.importorskip("skimage")
     tiny = {"n_views": 8, "width": 48, "height": 36, "n_points": 200, "supersampling": 1, "test_every": 4}
     monkeypatch.setattr("data_tools.claims.mesh.make_scene", lambda name: make_scene(name, **tiny))
@@ -71,7 +71,7 @@ def test_the_study_measures_meshes(tmp_path, capsys, monkeypatch):
     assert (out / "figure.png").stat().st_size > 10_000 and "| 3dgs-accel | midpoint |" in capsys.readouterr().out
 
 
-def test_the_study_trains_recipes_with_settings_and_refuses_unknown_ones(tmp_path, capsys, monkeypatch):
+def test_the_claim_trains_recipes_with_settings_and_refuses_unknown_ones(tmp_path, capsys, monkeypatch):
     pytest.importorskip("skimage")
     trained = []
 

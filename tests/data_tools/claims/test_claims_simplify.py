@@ -44,7 +44,7 @@ def dense_file(scene_folder):
 
 
 @pytest.mark.parametrize("restart", [(), ("--restart",)])
-def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
+def test_claim(scene_folder, dense_file, tmp_path, capsys, restart):
     out = tmp_path / "out"
     numbers = ("--fractions", "0.2,0.5", "--fine-tune", "2", "--seeds", "0,1")
     arguments = ["simplify", str(scene_folder), "--out", str(out), "--ply", str(dense_file), *numbers]
