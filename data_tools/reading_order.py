@@ -188,7 +188,7 @@ ORDER = (
         ("app/",),
         (
             Step(
-                ("app/cli/train.py", "app/runs/settings.py", "app/runs/run_folder.py", "app/runs/run.py"),
+                ("app/cli/train.py", "app/runs/options.py", "app/runs/run_folder.py", "app/runs/run.py"),
                 (),
                 "from a command line to a run and its folder",
             ),

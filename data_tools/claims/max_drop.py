@@ -30,10 +30,9 @@ from data_tools.claims.kit.claim import (
 )
 from data_tools.claims.kit.conditions import get_condition
 from minisplat_ref.app.runs.opened_run import Run, check_views
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.rate_distortion import paired_drop
-from minisplat_ref.app.runs.settings import Settings
 from minisplat_ref.app.runs.simplification import Target, decide, finish, measuring, metrics_of
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import CORE
 from minisplat_ref.interface.arguments import decibels, list_of
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED
@@ -75,13 +74,10 @@ def train_run(scene: Scene, args: argparse.Namespace, seed: int) -> Run:
         scene=args.scene,
         downscale=args.downscale,
         test_every=TEST_EVERY,
-        undistort=False,
         recipe=args.recipe,
         schedule_iterations=recipe.iterations,
         iterations=recipe.iterations,
         seed=seed,
-        profile=GSPLAT_MAIN.name,
-        backend="cpu",
     )
     return Run(Path(args.scene), settings, as_trained(recipe, model), CORE, scene, model, None, None)
 

@@ -16,8 +16,8 @@ from data_tools.foreign_files.ksplat import write_ksplat
 from data_tools.fuzz.mutations import Choose, damage
 from minisplat_ref.app.inventory import take_inventory
 from minisplat_ref.app.runs import settings
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import CONFIG
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputWarning
@@ -132,9 +132,7 @@ def _read_cameras(_: Path, file: Path) -> object:
 
 def _write_config(folder: Path) -> None:
     scene = _scene().scene._replace(frame=FRAME)
-    own = settings.Settings(
-        "scene", 1, 8, False, RECIPE.name, 10, 10, 0, GSPLAT_MAIN.name, "cpu", set={"exposure": "true"}
-    )
+    own = Settings(scene="scene", recipe=RECIPE.name, schedule_iterations=10, iterations=10, set={"exposure": "true"})
     (folder / CONFIG).write_text(json.dumps(settings.to_config(own, RECIPE, scene)))
 
 

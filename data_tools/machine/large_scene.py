@@ -20,8 +20,9 @@ import numpy as np
 from data_tools.machine.process_memory import bytes_in_use, forget_peak, peak
 from minisplat_ref import memory
 from minisplat_ref.app.runs import room
-from minisplat_ref.app.runs.run import run_training
-from minisplat_ref.app.runs.settings import Settings, load_photographs, recipe_of
+from minisplat_ref.app.runs.options import Settings
+from minisplat_ref.app.runs.run import Training, run_training
+from minisplat_ref.app.runs.settings import load_photographs, recipe_of
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -143,15 +144,10 @@ def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
     """Train; return predicted and measured peaks, beyond the memory used before, and that of the process."""
     settings = Settings(
         scene=str(scene_folder),
-        downscale=1,
         test_every=TEST_EVERY,
-        undistort=False,
         recipe="3dgs-accel",
         schedule_iterations=N_ITERATIONS,
         iterations=N_ITERATIONS,
-        seed=0,
-        profile=GSPLAT_MAIN.name,
-        backend=CPU.name,
     )
     recipe = recipe_of(settings)._replace(events=())  # the number of Gaussians stays
     scene = load_photographs(settings)
@@ -159,7 +155,7 @@ def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
     state = initial_state(scene, recipe, settings.seed) if n is None else _state(scene, n)
     needs = room.foresee(scene, state, GSPLAT_MAIN, CPU)
     out.mkdir()
-    run_training(out, scene, settings, recipe, state)
+    run_training(Training(out, scene, settings, recipe, state))
     return {"foreseen": needs.at_the_peak, "peak": peak() - before, "process": peak(), "n_gaussians": needs.n_rows}
 
 

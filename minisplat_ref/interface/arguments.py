@@ -13,6 +13,8 @@ Commands = argparse._SubParsersAction
 
 BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
 CUDA = ("cuda", "cuda-atomic")  # need a GPU
+PROFILE_HELP = f"rasteriser conventions: {', '.join(PROFILES)} (default {{default}})"
+BACKEND_HELP = "cpu[-exact], reference, cuda[-atomic] (default {default})"
 VIEWER_PORT = 8080
 SYNTHETIC_SCENES = (  # datasets.synthetic.SCENE_NAMES, which would load NumPy
     *("room", "plain-wall", "glossy", "outdoor"),
@@ -133,12 +135,12 @@ def assignment(text: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
-def color(text: str) -> tuple[float, ...]:
+def color(text: str) -> list[float]:
     """Parse R,G,B from 0 to 255 to three numbers from 0 to 1."""
     values = tuple(int(word) if word.isdecimal() else -1 for word in text.split(","))
     if len(values) != 3 or not all(0 <= value <= 255 for value in values):
         raise argparse.ArgumentTypeError(f"{text!r} is not a colour such as 255,255,255")
-    return tuple(value / 255.0 for value in values)
+    return [value / 255.0 for value in values]
 
 
 def option_name(name: str) -> str:
@@ -146,32 +148,14 @@ def option_name(name: str) -> str:
     return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"
 
 
-def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | None, whose: str = "") -> None:
-    """Add ``--profile``, a key of ``PROFILES``, and ``--backend``.
-
-    Parameters
-    ----------
-    parser : ArgumentParser or group
-    default : str or None
-        Value of both when they are not given.
-    whose : str
-        What the command falls back to before GSPLAT_MAIN and cpu, for the help.
-    """
-    parser.add_argument(
-        "--profile",
-        type=str.upper,
-        choices=tuple(PROFILES),
-        default=default,
-        metavar="NAME",
-        help=f"rasteriser conventions: {', '.join(PROFILES)} (default {whose}{GSPLAT_MAIN.name})",
-    )
-    parser.add_argument(
-        "--backend",
-        choices=(*BACKENDS, *CUDA),
-        default=default,
-        metavar="NAME",
-        help=f"cpu[-exact], reference, cuda[-atomic] (default {whose}cpu)",
-    )
+def add_renderer_arguments(parser: argparse._ActionsContainer) -> None:
+    """Add ``--profile``, a key of ``PROFILES``, and ``--backend``, None where they are not given: those of the run."""
+    for option, text, parse, choices, default in (
+        ("--profile", PROFILE_HELP, str.upper, tuple(PROFILES), GSPLAT_MAIN.name),
+        ("--backend", BACKEND_HELP, str, (*BACKENDS, *CUDA), "cpu"),
+    ):
+        text = text.format(default=f"the run's, or {default}")
+        parser.add_argument(option, type=parse, choices=choices, metavar="NAME", help=text)
 
 
 def add_worker_arguments(

@@ -13,6 +13,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +23,10 @@ from minisplat_ref.app.blocks.coverage import Coarse, cover
 from minisplat_ref.app.blocks.grid import Block, divide, ground_plane
 from minisplat_ref.app.listing_file import select
 from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.part import Part, Plane, Region, box_from_json
 from minisplat_ref.app.runs.scoring import renderer_of
-from minisplat_ref.app.runs.settings import Settings, load, load_model, recipe_of
+from minisplat_ref.app.runs.settings import load, load_model, recipe_of
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import Listing
@@ -66,7 +68,7 @@ class Asked(NamedTuple):
         whole = self.settings.iterations
         n = COARSE_ITERATIONS if recipe_of(self.settings).cooling is not None else whole // COARSE_PART
         n = max(1, min(n, whole))
-        return self.settings._replace(recipe=COARSE_RECIPE, iterations=n, schedule_iterations=n, **FRESH)
+        return replace(self.settings, recipe=COARSE_RECIPE, iterations=n, schedule_iterations=n, **FRESH)
 
 
 class Planned(NamedTuple):
@@ -91,7 +93,8 @@ class Plan(NamedTuple):
 
     def settings_of(self, asked: Asked, planned: Planned) -> Settings:
         """Return the settings of the training of a block."""
-        return asked.settings._replace(
+        return replace(
+            asked.settings,
             iterations=planned.iterations,
             schedule_iterations=planned.iterations,
             init=str(asked.run_folder_of(COARSE).resolve()),

@@ -26,8 +26,9 @@ from minisplat_ref.app.blocks.plan import (
     too_large,
 )
 from minisplat_ref.app.runs.cluster import Workers, carry_out_all
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import BLOCK_PLAN, has_begun
-from minisplat_ref.app.runs.settings import Settings, list_photographs, load_frame, load_photographs, recipe_of
+from minisplat_ref.app.runs.settings import list_photographs, load_frame, load_photographs, recipe_of
 from minisplat_ref.app.runs.trainings import HEADINGS, status_of, train_here, words_of, words_to_end
 from minisplat_ref.app.runs.worker import Job
 from minisplat_ref.errors import InputError

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from minisplat_ref.app.runs.options import N_ITERATIONS, Settings, add_settings
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import (
     Commands,
@@ -21,10 +22,10 @@ if TYPE_CHECKING:
     from minisplat_ref.types import Scene
 
 DEFAULTS: dict[str, Any] = {
-    "iterations": (3000,),
-    "seeds": (0,),
-    "downscale": 1,
-    "test_every": 8,
+    "iterations": (N_ITERATIONS,),
+    "seeds": (Settings.seed,),
+    "downscale": Settings.downscale,
+    "test_every": Settings.test_every,
     "eval_every": None,
     "budget": None,
     "simplify": None,
@@ -86,18 +87,13 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--eval-every", type=integer(1), metavar="K", help="measure test views each K-th (default 24 times in all)"
     )
-    parser.add_argument(
-        "--budget", type=integer(1), metavar="N", help="as for train, for the recipes that simplify to one"
-    )
-    parser.add_argument(
-        "--simplify", choices=("sampling", "rank", "merging"), metavar="S", help="likewise: sampling, rank or merging"
-    )
-    parser.add_argument("--scene-type", choices=("indoor", "outdoor"), metavar="T", help="likewise: indoor or outdoor")
-    parser.add_argument(
-        "--downscale", type=integer(1), metavar="D", help="make the photographs D times smaller (default 1)"
-    )
-    parser.add_argument(
-        "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing (default 8)"
+    add_settings(
+        parser,
+        budget="as for train, for the recipes that simplify to one",
+        simplify="likewise: sampling, rank or merging",
+        scene_type="likewise: indoor or outdoor",
+        downscale="make the photographs D times smaller (default {default})",
+        test_every="hold out every K-th for testing (default {default})",
     )
     parser.add_argument("--folds", type=integer(2), metavar="K", help="train K times: hold out each photograph once")
     parser.add_argument("--init", type=Path, metavar="START", help="as for train: points or run to start from")

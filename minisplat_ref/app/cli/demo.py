@@ -54,10 +54,10 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs.demo_report import report_html, view_images
     from minisplat_ref.app.runs.first_use import compile_kernels
     from minisplat_ref.app.runs.next_steps import PAGE, live_view
-    from minisplat_ref.app.runs.run import run_training
+    from minisplat_ref.app.runs.options import Settings
+    from minisplat_ref.app.runs.run import Training, run_training
     from minisplat_ref.app.runs.scoring import summary
-    from minisplat_ref.app.runs.settings import Settings, load_photographs, recipe_of
-    from minisplat_ref.constants import GSPLAT_MAIN
+    from minisplat_ref.app.runs.settings import load_photographs, recipe_of
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import write_scene
     from minisplat_ref.training.initial_state import initial_state
@@ -70,22 +70,17 @@ def run(args: argparse.Namespace) -> int:
     write_scene(synthetic, folder / "scene", {"scene": "room", **SCENE})
     settings = Settings(
         scene=str((folder / "scene").resolve()),
-        downscale=1,
         test_every=SCENE["test_every"],
-        undistort=False,
         recipe=RECIPE,
         schedule_iterations=SCHEDULE_ITERATIONS,
         iterations=args.iterations,
-        seed=0,
-        profile=GSPLAT_MAIN.name,
-        backend="cpu",
     )
     scene = load_photographs(settings)
     recipe = recipe_of(settings)
     state = initial_state(scene, recipe, settings.seed)
     compile_kernels(settings.backend)
     with terminated_like_interrupted(), run_folder.hold_folder(folder):
-        outcome = run_training(folder, scene, settings, recipe, state)
+        outcome = run_training(Training(folder, scene, settings, recipe, state))
     if outcome.evaluation is None:
         print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
         return 130

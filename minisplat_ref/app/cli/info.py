@@ -11,7 +11,7 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.interface.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
-    from minisplat_ref.app.runs.settings import Settings
+    from minisplat_ref.app.runs.options import Settings
     from minisplat_ref.io.label import Label
     from minisplat_ref.types import Floats
 
@@ -150,13 +150,15 @@ def _shape(array: "Floats") -> str:
 
 
 def _run_rows(folder: Path) -> Rows:
+    from dataclasses import asdict
+
     from minisplat_ref.app.runs.checkpoints import newest
     from minisplat_ref.app.runs.run_folder import CHECKPOINT, EVENTS, METRICS, PREVIOUS, read_json_object
     from minisplat_ref.app.runs.settings import load
 
     settings = load(folder)
     rows = [("state", _state_of_run(folder, settings.iterations))]
-    rows += [(name.replace("_", " "), _short(value)) for name, value in settings._asdict().items() if _says(value)]
+    rows += [(name.replace("_", " "), _short(value)) for name, value in asdict(settings).items() if _says(value)]
     if (folder / METRICS).exists():
         metrics = read_json_object(folder / METRICS)
         rows += [

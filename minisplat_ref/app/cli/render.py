@@ -91,7 +91,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
-    add_renderer_arguments(parser, None, "the run's, or ")
+    add_renderer_arguments(parser)
     parser.set_defaults(run=run)
 
 

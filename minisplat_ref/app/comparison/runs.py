@@ -10,10 +10,9 @@ from typing import Any
 
 from minisplat_ref.app.comparison.plan import Plan, Run, load_plan
 from minisplat_ref.app.runs.cluster import Workers, carry_out_all
-from minisplat_ref.app.runs.settings import Settings
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.trainings import HEADINGS, Status, status_of, train_here, words_to_end
 from minisplat_ref.app.runs.worker import Job
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.arguments import option_name
@@ -137,9 +136,6 @@ def settings_of(plan: Plan, run: Run) -> Settings:
     return Settings(
         scene=str(plan.scene.resolve()),
         schedule_iterations=run.iterations,
-        undistort=False,
-        profile=GSPLAT_MAIN.name,
-        backend="cpu",
         **_options(plan, run),
     )
 

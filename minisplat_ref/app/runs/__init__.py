@@ -1,10 +1,11 @@
 """Runs: a training with everything around it, and what is done with its folder afterwards.
 
 Train: what ``train`` does
-    :mod:`.settings` (what was asked for, ``config.json``), :mod:`.proposed_size` and :mod:`.room` (which size fits into
-    memory), :mod:`.start` (points to start from), :mod:`.run_folder` (the folder is made; which file has which name),
-    :mod:`.run` (the training), :mod:`.first_use` (compiles the kernels ahead), :mod:`.checkpoints` (the last two, and
-    the newest model), :mod:`.fingerprint` (which scene the run belongs to).
+    :mod:`.options` (all that can be asked for, each declared once), :mod:`.settings` (what was asked for in
+    ``config.json``, and its recipe, photographs and model), :mod:`.proposed_size` and :mod:`.room` (which size fits
+    into memory), :mod:`.start` (points to start from), :mod:`.run_folder` (the folder is made; which file has which
+    name), :mod:`.run` (the training), :mod:`.first_use` (compiles the kernels ahead), :mod:`.checkpoints` (the last
+    two, and the newest model), :mod:`.fingerprint` (which scene the run belongs to).
 
 Several runs at once
     :mod:`.cluster` (connect to workers, check them, hand out), :mod:`.worker` (what a worker does with a job),

@@ -7,12 +7,14 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from minisplat_ref import memory
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import CHECKPOINT, POINT_CLOUD, PREVIOUS, measured_step
-from minisplat_ref.app.runs.settings import Settings, load_model, recipe_of
+from minisplat_ref.app.runs.settings import load_model, recipe_of
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.checkpoint import WAY_OUT, DamagedCheckpoint, load_checkpoint, load_metadata
 from minisplat_ref.training.saved_state import load_state, save_state
@@ -88,7 +90,7 @@ def load(folder: Path, settings: Settings) -> TrainState:
         length = recipe.get("iterations") if isinstance(recipe, dict) else None
         if type(length) is not int or length < 1:
             raise InputError(f"{path} does not say how long its schedule is; {WAY_OUT}")
-        return load_state(path, recipe_of(settings._replace(schedule_iterations=length)))
+        return load_state(path, recipe_of(replace(settings, schedule_iterations=length)))
 
     return newest(folder, read)
 

@@ -5,6 +5,7 @@ level is a decision like others, and the test views stay out of it.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -247,7 +248,8 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     if path.is_dir():
         settings = load(path)
         photographs = load_photographs(
-            settings._replace(
+            replace(
+                settings,
                 scene=settings.scene if scene is None else str(scene),
                 downscale=settings.downscale if downscale is None else downscale,
             ),

@@ -32,11 +32,11 @@ from minisplat_ref.app.reports.page import (
 )
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.next_steps import PAGE, live_view
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.report_parts import ERROR_TEXT, training_curves, view_panel
 from minisplat_ref.app.runs.run import Outcome
 from minisplat_ref.app.runs.scoring import load_trained
-from minisplat_ref.app.runs.settings import Settings
 from minisplat_ref.datasets.synthetic import SyntheticScene
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.reference.depth import expected_depth

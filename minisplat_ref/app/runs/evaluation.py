@@ -4,6 +4,7 @@
 own: another split of the same photographs, a run that has not ended, and other photographs where they are asked for.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,8 +13,9 @@ from minisplat_ref.app.runs.checkpoints import Saved, newest_model
 from minisplat_ref.app.runs.first_use import warn_if_not_kept
 from minisplat_ref.app.runs.model_file import choose_owner, label_of, read_population
 from minisplat_ref.app.runs.notices import warn_of_model
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.scoring import score, to_metrics
-from minisplat_ref.app.runs.settings import Settings, load, load_frame, load_lpips, load_photographs, place_model
+from minisplat_ref.app.runs.settings import load, load_frame, load_lpips, load_photographs, place_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, owner_of
 from minisplat_ref.metrics import Evaluation
@@ -61,7 +63,8 @@ def evaluate_run(
         The scene is not the run's and ``out`` is not given, there is nothing to measure, or a file is damaged.
     """
     settings = load(folder)
-    asked = settings._replace(
+    asked = replace(
+        settings,
         scene=str(scene or settings.scene),
         test_every=settings.test_every if test_every is None else test_every,
         fold=settings.fold if test_every is None else 0,

@@ -1,12 +1,14 @@
 """A run opened to be simplified: its model, recipe and photographs, and the folds by which its sizes are measured."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from minisplat_ref.app.runs import fingerprint, run_folder
 from minisplat_ref.app.runs.checkpoints import newest_model
-from minisplat_ref.app.runs.settings import Settings, load, load_frame, load_photographs, recipe_of
+from minisplat_ref.app.runs.options import Settings
+from minisplat_ref.app.runs.settings import load, load_frame, load_photographs, recipe_of
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.extension import CORE, Extension, owner_of
@@ -82,7 +84,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     if saved.unfinished is not None:
         message = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
-    settings = settings if scene is None else settings._replace(scene=str(scene.resolve()))
+    settings = settings if scene is None else replace(settings, scene=str(scene.resolve()))
     if not Path(settings.scene).exists():
         raise InputError(f"{settings.scene}, the scene of {folder}, is not there: --scene PATH says where it is now")
     photographs = load_photographs(settings, load_frame(folder))

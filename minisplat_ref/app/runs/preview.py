@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from minisplat_ref.app.reports.images import error_image, side_by_side, to_8_bits
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.app.runs.scoring import Trained, renderer_of
-from minisplat_ref.app.runs.settings import Settings
 from minisplat_ref.io import write_image
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Scene

@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from minisplat_ref.app.runs.settings import Settings
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.io.images import downscaled_size
 from minisplat_ref.io.scene import rescale_camera

@@ -12,13 +12,15 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.app.runs import checkpoints, curve, events, fingerprint, run_folder
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Clock, Progress
 from minisplat_ref.app.runs.scoring import measure, score, to_metrics
-from minisplat_ref.app.runs.settings import Settings, save_model, to_config
+from minisplat_ref.app.runs.settings import save_model, to_config
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.datasets.synthetic.surface import Surface, surface_distance, true_surface
 from minisplat_ref.errors import InputError
@@ -50,55 +52,61 @@ class Outcome(NamedTuple):
     """False when Ctrl-C ended it; everything has been saved then, too."""
 
 
-def run_training(
-    folder: Path,
-    scene: Scene,
-    settings: Settings,
-    recipe: Recipe,
-    state: TrainState,
-    network: Network | None = None,
-    check_every: int = Guard().every,
-    watches: Sequence[Watch] = (),
-) -> Outcome:
-    """Train, save and measure.
+class Training(NamedTuple):
+    """A training and all that it takes."""
 
-    Parameters
-    ----------
-    folder : Path
-        The run; exists, and no other process writes there.
-    scene : Scene
-        The loaded scene.
-    settings : Settings
-        Of the run; ``iterations`` says where to stop.
-    recipe : Recipe
-        The recipe of the settings, scaled to ``settings.schedule_iterations``.
-    state : TrainState
-        Where to start; changed in place.
-    network : Network, optional
-        Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after.
-    check_every : int
-        Iterations after which parameters and gradients are looked at for numbers that are not finite.
-    watches : sequence of callable
-        What shows the training to a person while it runs, such as :func:`.preview.make_preview`.
+    folder: Path
+    """The run; exists, and no other process writes there."""
+    scene: Scene
+    """The loaded scene."""
+    settings: Settings
+    """Of the run; ``iterations`` says where to stop."""
+    recipe: Recipe
+    """The recipe of the settings, scaled to ``settings.schedule_iterations``."""
+    state: TrainState
+    """Where to start; changed in place."""
+    network: Network | None = None
+    """Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after."""
+    notes: Sequence[str] = ()
+    """What a person is told as it begins."""
+    check_every: int = Guard().every
+    """Iterations after which parameters and gradients are looked at for numbers that are not finite."""
+    watches: Sequence[Watch] = ()
+    """What shows the training to a person while it runs, such as :func:`.preview.make_preview`."""
 
-    Returns
-    -------
-    Outcome
+
+def run_training(training: Training) -> Outcome:
+    """Train to the end or to Ctrl-C, save and measure.
 
     Raises
     ------
     InputError
         A file cannot be written, memory has no room, or a number is not finite: says what has been saved.
     """
+    folder, scene, settings, recipe, state = training[:5]
     with saving_on_error(folder, recipe, state):
         run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
         run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(scene))
         if state.step == 0:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
-        clock = _train(folder, scene, settings, recipe, state, surface, check_every, watches)
-        is_saved = _save(folder, settings, recipe, state)
-        evaluation = _measure(folder, scene, settings, state, clock, surface, network) if is_saved else None
+        total = settings.iterations if recipe.cooling is None else state.pace.last_step
+        progress = Progress(folder / run_folder.LOG, state.step, total, recipe.cooling)
+        on_step = _on_step(training, progress, surface)
+        with progress:
+            with contextlib.suppress(KeyboardInterrupt):
+                train(
+                    scene,
+                    recipe._replace(iterations=settings.iterations),
+                    seed=settings.seed,
+                    state=state,
+                    on_step=on_step,
+                    backend=get_backend(settings.backend),
+                    conventions=PROFILES[settings.profile],
+                    guard=Guard(training.check_every, settings.drop_bad_steps, folder, asdict(settings)),
+                )
+            clock = progress.clock
+        evaluation = _measure(training, clock, surface) if _save(training) else None
         return Outcome(evaluation, clock.seconds, state.step >= last_step(state, recipe, settings.iterations))
 
 
@@ -121,19 +129,9 @@ def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator
         raise
 
 
-def _train(
-    folder: Path,
-    scene: Scene,
-    settings: Settings,
-    recipe: Recipe,
-    state: TrainState,
-    surface: Surface | None,
-    check_every: int,
-    watches: Sequence[Watch],
-) -> Clock:
-    """Train to the end or to Ctrl-C; return how long it took."""
-    total = settings.iterations if recipe.cooling is None else state.pace.last_step
-    progress = Progress(folder / run_folder.LOG, state.step, total, recipe.cooling)
+def _on_step(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
+    """Return the callback of the loop: records, measurements and checkpoints."""
+    folder, scene, settings, recipe, state = training[:5]
     callbacks: list[Callable[[StepReport], None]] = [progress]
     if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
         curve.keep_until(folder / run_folder.EVENTS, state.step)
@@ -141,7 +139,7 @@ def _train(
     if settings.eval_every:
         curve.keep_until(folder / run_folder.CURVE, state.step)
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
-    callbacks.extend(watch(folder, scene, settings, progress) for watch in watches)
+    callbacks.extend(watch(folder, scene, settings, progress) for watch in training.watches)
     if settings.minutes is not None:
         callbacks.append(_in_time(settings, recipe, state, progress, len(scene.train_views)))
     callbacks.append(checkpoints.save_regularly(folder, recipe))  # after the records: what it continues from is in them
@@ -150,19 +148,7 @@ def _train(
         for callback in callbacks:
             callback(report)
 
-    with progress:
-        with contextlib.suppress(KeyboardInterrupt):
-            train(
-                scene,
-                recipe._replace(iterations=settings.iterations),
-                seed=settings.seed,
-                state=state,
-                on_step=on_step,
-                backend=get_backend(settings.backend),
-                conventions=PROFILES[settings.profile],
-                guard=Guard(check_every, settings.drop_bad_steps, folder, settings._asdict()),
-            )
-        return progress.clock
+    return on_step
 
 
 def _in_time(
@@ -199,8 +185,9 @@ def _in_time(
     return on_step
 
 
-def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -> bool:
+def _save(training: Training) -> bool:
     """Save the state and the model; return whether there is something to measure, and time."""
+    folder, _, settings, recipe, state = training[:5]
     if not state.is_whole or state.step == 0:  # Ctrl-C twice, or before anything was learned
         return False
     try:
@@ -215,25 +202,18 @@ def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -
     return True
 
 
-def _measure(
-    folder: Path,
-    scene: Scene,
-    settings: Settings,
-    state: TrainState,
-    clock: Clock,
-    surface: Surface | None,
-    network: Network | None,
-) -> Evaluation | None:
+def _measure(training: Training, clock: Clock, surface: Surface | None) -> Evaluation | None:
     """Measure the model, write the page and then the measures, the last that a run does.
 
     Returns None when Ctrl-C comes meanwhile.
     """
     from minisplat_ref.app.runs.run_report import write_report  # draws curves: a training would wait for that
 
+    folder, scene, settings, _, state = training[:5]
     peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
     n_gaussians = len(state.gaussians.means)
     try:
-        evaluation = score(folder, scene, state.model, settings, network)
+        evaluation = score(folder, scene, state.model, settings, training.network)
         if settings.eval_every:
             further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
             curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)

@@ -13,9 +13,10 @@ from minisplat_ref.app.runs.decisions_report import decisions_section
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
 from minisplat_ref.app.runs.fired import Fired
 from minisplat_ref.app.runs.next_steps import ways_to_look
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
-from minisplat_ref.app.runs.settings import Settings, load
+from minisplat_ref.app.runs.settings import load
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import PURPLE
 from minisplat_ref.io import read_image

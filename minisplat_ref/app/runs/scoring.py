@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.app.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.app.runs.checkpoints import newest_model
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import RENDERS
-from minisplat_ref.app.runs.settings import Settings, load, load_background, recipe_of
+from minisplat_ref.app.runs.settings import load, load_background, recipe_of
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.interface.progress import progress_bar

@@ -1,19 +1,19 @@
-"""The settings of a run, and their file ``config.json``."""
+"""What the settings of a run stand for: its recipe, its photographs and its model; and their file ``config.json``."""
 
 import platform
 import reprlib
-from collections.abc import Mapping
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref import __version__
 from minisplat_ref.app.runs.model_file import label_for
+from minisplat_ref.app.runs.options import FIRST_NAMES, NAMES, Settings, first_wrong
 from minisplat_ref.app.runs.part import read_part
 from minisplat_ref.app.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
-from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
 from minisplat_ref.io import list_scene
@@ -36,7 +36,6 @@ from minisplat_ref.io.scene import Listing, build_reading, build_scene
 from minisplat_ref.mechanisms.cameras.models import check_optics
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics.lpips import Network, check_views, load_network
-from minisplat_ref.rendering.backends import BACKENDS, CUDA
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.calibration import SHIFTS
 from minisplat_ref.training.schedule import Recipe, configure, describe, parse_settings, settings_of
@@ -46,63 +45,6 @@ CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging"
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
 SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters of any recipe
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")  # those that are installed
-
-
-class Settings(NamedTuple):
-    """Everything besides the scene's files that decides the result."""
-
-    scene: str
-    """Absolute path of the scene's folder."""
-    downscale: int
-    """Factor by which the photographs are made smaller."""
-    test_every: int
-    """One view of this many is held out for testing; 0: none."""
-    undistort: bool
-    """Whether lens distortion is removed while loading."""
-    recipe: str
-    """Name of the recipe."""
-    schedule_iterations: int
-    """Number of iterations that the recipe's milestones are scaled to; stays when a run is made longer."""
-    iterations: int
-    """Iteration at which to stop."""
-    seed: int
-    """Seed of all random draws."""
-    profile: str
-    """Name of the rasteriser's conventions."""
-    backend: str
-    """Name of the backend."""
-    budget: int | None = None
-    """Gaussians that a simplification keeps at most; None for the recipe's own part of the candidates."""
-    simplify: str | None = None
-    """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
-    scene_type: str | None = None
-    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
-    extension: str | None = None
-    """Name of an extension that a recipe of the core is trained with; a recipe of an extension brings its own."""
-    set: dict[str, str] = {}  # noqa: RUF012  (never written to)
-    """Settings of the recipe's events, losses and calibrations, as text: ``--set NAME=VALUE``."""
-    eval_every: int = 0
-    """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
-    drop_bad_steps: bool = False
-    """Whether a step whose gradient is not finite is left out; otherwise it ends the training."""
-    lpips_weights: str | None = None
-    """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
-    minutes: float | None = None
-    """Time that the training may take, for a recipe that decides its own length; the result depends on the machine."""
-    max_drop: float | None = None
-    """PSNR, dB, that a simplification after the training may lose; None: there is none."""
-    max_bytes: int | None = None
-    """Size that the PLY of a simplification after the training may have; None: there is none."""
-    init: str | None = None
-    """Absolute path of the PLY or run that the training starts from, not read again; None for the scene's points."""
-    model: str | None = None
-    """Folder of the COLMAP model, relative to the scene; None for the first that is there."""
-    background: list | None = None
-    """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
-    block: str | None = None
-    """Absolute path of the part of the scene, a :class:`~minisplat_ref.app.runs.part.Part`; None for the whole."""
-    fold: int = 0
-    """Offset of the first held-out photograph, below ``test_every``: one fold of a cross-validation."""
 
 
 def recipe_of(settings: Settings) -> Recipe:
@@ -117,8 +59,8 @@ def recipe_of(settings: Settings) -> Recipe:
     recipe = configure(recipe, **parse_settings(recipe, settings.set))
     options = {
         "--budget": ("budget", settings.budget),
-        "--simplify": ("choose", _choose("simplify", CHOICES, settings.simplify)),
-        "--scene-type": ("metric", _choose("scene_type", METRICS, settings.scene_type)),
+        "--simplify": ("choose", settings.simplify and CHOICES[settings.simplify]),
+        "--scene-type": ("metric", settings.scene_type and METRICS[settings.scene_type]),
     }
     for option, (name, value) in options.items():
         if value is None:
@@ -128,13 +70,6 @@ def recipe_of(settings: Settings) -> Recipe:
             raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
         recipe = configure(recipe, **{name: value})
     return recipe
-
-
-def _choose(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
-    """Return the choice of a name, None where none was made."""
-    if key is not None and str(key) not in choices:
-        raise InputError(f"{name} {key!r} is unknown; choose one of {', '.join(choices)}")
-    return None if key is None else choices[key]
 
 
 def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> None:
@@ -204,7 +139,7 @@ def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any
     """Return what ``config.json`` holds: the settings, the recipe spelled out, and the versions that run it."""
     versions = {package: found for package in REPORTED_PACKAGES if (found := _version_of(package)) is not None}
     return {
-        "settings": settings._asdict(),
+        "settings": asdict(settings),
         "background": scene.background.tolist(),
         **({} if scene.frame == FILE_FRAME else {"frame": frame_to_json(scene.frame)}),
         "recipe": describe(recipe),
@@ -221,27 +156,22 @@ def load(folder: Path) -> Settings:
     InputError
         There is no such folder, it holds no run, or one of another version.
     """
-    config = _read_config(folder)
-    try:
-        settings = Settings(**config["settings"])
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder / CONFIG} is not the configuration of a training of this version: {error}"
-        ) from error
-    kinds = {**Settings.__annotations__, "set": dict}  # of which isinstance cannot tell what it maps to what
-    wrong = [name for name, value in settings._asdict().items() if not isinstance(value, kinds[name])]
-    if not wrong:
-        texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
-        wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
-        wrong += ["backend"] * (settings.backend not in (*BACKENDS, CUDA))
-        wrong += ["background"] * (settings.background is not None and as_array(settings.background, (3,)) is None)
-    if wrong:
-        name = wrong[0]
-        raise InputError(
-            f"{folder / CONFIG}: the setting {name} is {reprlib.repr(getattr(settings, name))}, which no training of"
-            " this version has written"
-        )
+    path, content = folder / CONFIG, _read_config(folder).get("settings")
+    if not isinstance(content, dict):
+        raise _of_another_version(path, "it has no settings")
+    if lacking := [name for name in FIRST_NAMES if name not in content]:
+        raise _of_another_version(path, f"it has no setting {lacking[0]}")
+    if surplus := [name for name in content if name not in NAMES]:
+        raise _of_another_version(path, f"{reprlib.repr(surplus[0])} is no setting")
+    settings = Settings(**content)
+    if wrong := first_wrong(settings):
+        value = reprlib.repr(content[wrong])
+        raise InputError(f"{path}: the setting {wrong} is {value}, which no training of this version has written")
     return settings
+
+
+def _of_another_version(path: Path, why: str) -> InputError:
+    return InputError(f"{path} is not the configuration of a training of this version: {why}")
 
 
 def load_background(folder: Path) -> Floats:

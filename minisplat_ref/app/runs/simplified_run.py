@@ -5,6 +5,7 @@ folder like that of a training. Nothing in it depends on the time: the same run 
 """
 
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -150,7 +151,7 @@ def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation
     """Write what makes the folder a run: its configuration, cameras and measures."""
     config = run_folder.read_json_object(run.folder / run_folder.CONFIG)
     about = {name: result[name] for name in ("run", "target", "fine_tune")}
-    config |= {"settings": run.settings._asdict(), "simplified": about}
+    config |= {"settings": asdict(run.settings), "simplified": about}
     run_folder.write_json(folder / run_folder.CONFIG, config)
     if (run.folder / run_folder.CAMERAS).exists():
         shutil.copyfile(run.folder / run_folder.CAMERAS, folder / run_folder.CAMERAS)

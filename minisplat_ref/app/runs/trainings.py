@@ -15,7 +15,8 @@ from types import FrameType
 from typing import Literal
 
 from minisplat_ref.app.runs import run_folder
-from minisplat_ref.app.runs.settings import Settings, load
+from minisplat_ref.app.runs.options import NAMES, OPTIONS, Settings
+from minisplat_ref.app.runs.settings import load
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import option_name
 
@@ -47,7 +48,7 @@ def status_of(folder: Path, asked: Settings) -> Status:
         run_folder.check_free(folder)
         return "new"
     ours = load(folder)
-    for name in Settings._fields:
+    for name in NAMES:
         is_, should = getattr(ours, name), getattr(asked, name)
         if is_ != should:
             raise InputError(
@@ -86,8 +87,9 @@ def words_to_end(folder: Path, asked: Settings, first: Sequence[str]) -> list[st
 def words_of(settings: Settings, folder: Path) -> list[str]:
     """Return the command that begins a training with these settings in a folder, as words."""
     words = ["train", settings.scene, "--out", str(folder)]
-    for name, value in settings._asdict().items():
-        if name in ("scene", "schedule_iterations", "set", "background") or value is None or value is False:
+    for name in OPTIONS:
+        value = getattr(settings, name)
+        if name in ("set", "background") or value is None or value is False:
             continue
         words += [option_name(name)] if value is True else [option_name(name), str(value)]
     for name, text in settings.set.items():

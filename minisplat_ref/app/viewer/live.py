@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.app.runs.scoring import Trained, renderer_of
-from minisplat_ref.app.runs.settings import Settings
 from minisplat_ref.app.viewer.browser import Content, Viewer
 from minisplat_ref.app.viewer.photographs import thumbnails
 from minisplat_ref.io.viewpoints import scene_viewpoints
