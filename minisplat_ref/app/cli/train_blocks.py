@@ -4,6 +4,7 @@ import shutil
 import sys
 from typing import TYPE_CHECKING, Any
 
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import option_name
 
@@ -29,9 +30,9 @@ WHOLE_ONLY = {
 
 
 def refuse_options(given: dict[str, Any]) -> None:
-    """Refuse options of a training of the whole."""
+    """Refuse options of a training of the whole, unless they say what holds without them, as those of --config may."""
     for name, instead in WHOLE_ONLY.items():
-        if name in given:
+        if name in given and given[name] != getattr(Settings, name, None):
             raise InputError(f"{option_name(name)} does not go with --blocks ({instead}): leave it out")
 
 

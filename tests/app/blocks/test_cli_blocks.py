@@ -257,6 +257,12 @@ def test_what_does_not_go_with_blocks(scene_folder, tmp_path, refused, options, 
     assert not (tmp_path / "out").exists()
 
 
+def test_the_settings_of_another_run_go_with_blocks(finished, refused):
+    config = ["--config", finished, "--out", finished, *BLOCKS]
+    assert "does not go with --blocks" not in refused("train", *config)  # but the folder is taken
+    assert "--minutes does not go with --blocks" in refused("train", *config, "--minutes", "1")
+
+
 def test_workers_are_for_blocks(scene_folder, tmp_path, refused):
     line = refused("train", scene_folder, *OPTIONS, "--workers", "2", "--out", tmp_path / "out")
     assert "--workers and --cluster train blocks at once" in line
