@@ -1,6 +1,6 @@
 """The study ``cus/growth``: trainings with and without the growing of anchors, from many points and from few.
 
-Scene, teacher and measures are those of ``cus/floats`` (:mod:`.study`). Where growing adds anchors, more floats may be
+Scene, teacher and measures are those of ``cus/floats`` (:mod:`.floats`). Where growing adds anchors, more floats may be
 all that helps, so a third arm has no growing but smaller voxels from the start; from few points there are no more
 anchors to be had like this, and the arm is left out.
 """

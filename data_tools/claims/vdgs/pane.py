@@ -10,7 +10,7 @@ with one opacity of the pane for all views, and keep their number of Gaussians. 
 network in the two modes of opacity. Errors of opacity are over views that were held out, and over the Gaussians of the
 pane.
 
-The start is favourable, and the network has many more floats than these few Gaussians: :mod:`.floats_study` compares at
+The start is favourable, and the network has many more floats than these few Gaussians: :mod:`.floats` compares at
 equal floats.
 """
 

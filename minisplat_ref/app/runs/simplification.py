@@ -1,12 +1,12 @@
 """``simplify``: a run made smaller after the fact, and what that costs, measured on views that take no part.
 
 A size is reached by merging near neighbours, those of small blend weight first
-(:func:`..strategy.simplify.merge_neighbours`), and is then fine-tuned. The population of an extension, whose further
-fields may have no mean, keeps its Gaussians of the largest blend weight instead. Either way the weight is summed over
-pixels and views (equation 12 of Mini-Splatting).
+(:func:`minisplat_ref.strategy.simplify.merge_neighbours`), and is then fine-tuned. The population of an extension,
+whose further fields may have no mean, keeps its Gaussians of the largest blend weight instead. Either way the weight is
+summed over pixels and views (equation 12 of Mini-Splatting).
 
 What a size loses is measured by cross-validation: the *training* views are divided into folds
-(:attr:`..runs.opened_run.Run.folds`), and the views of each fold measure a copy that was fine-tuned without them. So
+(:attr:`.opened_run.Run.folds`), and the views of each fold measure a copy that was fine-tuned without them. So
 every training view counts, and the standard error is as small as the photographs allow. The model that is delivered
 begins with the same Gaussians, and is fine-tuned in the same way by all training views. (Weights say nothing about
 photographs, only about cameras.) The test views stay sealed until then.

@@ -318,6 +318,6 @@ def _mean_weights(weights: tuple[Floats, Floats], exists: Bools) -> tuple[Floats
 
 
 def _diff_vjp(v_difference: Floats, axis: int) -> Floats:
-    """Gradient of ``np.diff``: ``v_x_j = v_difference_(j-1) - v_difference_j``."""
+    """Gradient of ``np.diff``: ``v_x_j = v_difference_{j-1} - v_difference_j``."""
     padding = [(1, 1) if a == axis else (0, 0) for a in range(v_difference.ndim)]
     return -np.diff(np.pad(v_difference, padding), axis=axis)

@@ -80,7 +80,7 @@ def features(image: Floats) -> tuple[list[Floats], _Tape]:
 def features_vjp(tape: _Tape, v_maps: Sequence[Floats]) -> Floats:
     """Gradient of :func:`features`, from coarse to fine.
 
-    ``v_even += v_energy even / energy``, likewise odd; through the filters (:func:`..layers.convolve_vjp`); and the
+    ``v_even += v_energy even / energy``, likewise odd; through the filters (:func:`.layers.convolve_vjp`); and the
     gradient of a halved image goes on to the one it was made of.
 
     Parameters

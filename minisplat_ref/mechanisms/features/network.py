@@ -166,7 +166,7 @@ def features_vjp(net: Convolutions, tape: _Tape, v_maps: Sequence[Floats]) -> Fl
     """Gradient of :func:`features`, from the last convolution to the first.
 
     ``v_x`` of a convolution's output is what its tap and the layers behind it need; where the ReLU has cut off it is 0;
-    then follow :func:`..layers.convolve_vjp`, and :func:`..layers.max_pool_vjp` where the size was halved.
+    then follow :func:`.layers.convolve_vjp`, and :func:`.layers.max_pool_vjp` where the size was halved.
 
     Parameters
     ----------

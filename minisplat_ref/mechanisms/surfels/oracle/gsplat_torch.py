@@ -145,7 +145,7 @@ def _accumulate(
 def _along_rays(
     weights: Tensor, transmittances: Tensor, z: Tensor, pixels: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Return the median depth and the distortion [1, H, W, 1] of the hits; see :mod:`..ray_measures`."""
+    """Return the median depth and the distortion [1, H, W, 1] of the hits, as :mod:`..ray_measures` defines them."""
     torch, _ = load()
     is_first = torch.ones_like(pixels, dtype=torch.bool)
     is_first[1:] = pixels[1:] != pixels[:-1]
