@@ -1,4 +1,4 @@
-"""The oracle: what a backend is checked against, and how.
+"""The oracle: everything that a backend is checked against, and the checks.
 
 Each check answers one question, and ``minisplat-ref oracle`` runs it. Read them in this order:
 
@@ -23,5 +23,5 @@ module           content                                                        
 ``peers``        other renderers: gsplat in PyTorch and in CUDA, the 3DGS rasteriser           ``compare``
 ===============  ============================================================================  =============
 
-This package is about correctness only; for speed, and what it costs in digits, see :mod:`minisplat_ref.bench`.
+This package is about correctness only; for speed, and its cost in digits, see :mod:`minisplat_ref.bench`.
 """

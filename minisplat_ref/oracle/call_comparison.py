@@ -1,9 +1,9 @@
 """Compare another renderer's version of a call of gsplat's with ours in float64: the first stage that differs is named.
 
-A :class:`Call` says what is called, which arrays are compared, and which errors can be planted. A renderer is anything
-that returns, for a scene, arrays by name: the meta of the call, its images, and gradients. Stages that depend on others
-come after them, so that the first that differs is where to look: a wrong conic makes a wrong alpha, and that makes
-everything else wrong.
+A :class:`Call` defines what is called, which arrays are compared, and which errors can be planted. A renderer is
+anything that returns, for a scene, arrays by name: the meta of the call, its images, and gradients. Stages that depend
+on others come after them, so that the first that differs is where to look: a wrong conic makes a wrong alpha, and that
+makes everything else wrong.
 """
 
 import functools
@@ -31,7 +31,7 @@ class CallScene(NamedTuple):
 
     name: str
     what: str
-    """One line: what it is for."""
+    """One line: its purpose."""
     arguments: dict[str, Any]
     """Of the call: arrays in float64, and settings."""
     cotangents: dict[str, Floats]
@@ -48,7 +48,7 @@ class StageArray(NamedTuple):
     part: Callable[[np.ndarray], np.ndarray] = np.asarray
     """Returns what of it is compared."""
     is_of_rows: bool = False
-    """Whether rows of Gaussians are compared only where ours has a value: not where culled, which nobody reads."""
+    """Whether rows of Gaussians are compared only where ours has a value; culled rows are never read."""
 
 
 class PlantedInCall(NamedTuple):
@@ -56,7 +56,7 @@ class PlantedInCall(NamedTuple):
 
     what: str
     stage: str
-    """Where it has to be found: the name of a stage."""
+    """The name of the stage in which it has to be found."""
     plant: Callable[[Any], Any]
     """Turns the steps of the call into wrong ones."""
 
@@ -67,7 +67,7 @@ class Call(NamedTuple):
     name: str
     """That ``--call`` takes."""
     subject: str
-    """What it renders, for messages."""
+    """The primitive that it renders, for messages."""
     images: tuple[str, ...]
     """Names of its results before the meta."""
     stages: Mapping[str, StageArray]
@@ -212,7 +212,7 @@ def compare(call: Call, renderer: CallRenderer, scenes: Mapping[str, tuple[CallS
 
 
 def _is_given(ours: np.ndarray, radii: np.ndarray, other_radii: Any) -> np.ndarray:
-    """Return which rows of an array count: what is culled nobody reads, and who culls what is compared by itself."""
+    """Return the rows to compare: culled rows are excluded, and culling is compared separately."""
     axes = tuple(range(2, ours.ndim))
     is_given = (radii[..., 0] > 0) & np.any(ours != 0, axis=axes)
     if np.shape(other_radii) == radii.shape:
@@ -289,7 +289,7 @@ def _unpacked(function: Callable[..., Any]) -> Callable[..., Any]:
     """Switch off gsplat's packed projection, in which the meta has other rows and no camera is distorted."""
     try:
         has_it = "packed" in inspect.signature(function).parameters
-    except (TypeError, ValueError):  # compiled code may not tell
+    except (TypeError, ValueError):  # compiled code may have no signature
         has_it = False
     return functools.partial(function, packed=False) if has_it else function
 

@@ -19,7 +19,7 @@ class Case(NamedTuple):
     name: str
     """Unique in its report."""
     passed: bool
-    """Whether the result is as it should be."""
+    """Whether the result is correct."""
     figures: dict[str, Figure]
     """Measured values by the heading of their column."""
     note: str = ""

@@ -40,7 +40,7 @@ def check_model_gradients(
 ) -> Report:
     """Check the renderer of a representation, and further stages.
 
-    :func:`minisplat_ref.oracle.relatives.check_relative_gradients` checks all that an extension has of its own.
+    :func:`minisplat_ref.oracle.relatives.check_relative_gradients` checks everything that an extension adds.
 
     Parameters
     ----------
@@ -106,11 +106,11 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
     Parameters
     ----------
     backend : Backend
-        That the renderer is asked to use.
+        The one that the renderer has to use.
     setting : Setting
         Gaussians and camera.
     representation : Representation
-        Makes the population and the shared parameters, and draws them.
+        Makes the population and the shared parameters, and renders them.
     rng : Generator
         For the noise.
     """
@@ -159,7 +159,7 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
 def noisy_model(
     setting: Setting, view: View, representation: Representation, rng: np.random.Generator
 ) -> tuple[Model, Scene]:
-    """Return the Gaussians as a model of the representation, with noise in what is its own, and the scene of the view.
+    """Return the Gaussians as a model, with noise in the representation's additional fields, and the scene of the view.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ def make_setting(
     width, height : int
         Image, pixels.
     conventions : Conventions
-        Where its gradient is not the derivative of what is computed, as for INRIA's clamp, no alpha is clamped.
+        Where the gradient deviates from the derivative, as for INRIA's clamp, no alpha is clamped.
     sh_degree : int
         Stored and active.
 

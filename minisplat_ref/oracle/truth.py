@@ -1,4 +1,4 @@
-"""A truth more precise than float64: compute, from definitions and in 50 digits, what loses digits in our formulas.
+"""A truth more precise than float64: quantities whose formulas lose digits, from their definitions and in 50 digits.
 
 Nothing here is one of our formulas. A rotation is the sandwich product q v q*; a projected covariance uses the
 numerical derivative of the camera's map itself; an inverse is a linear solve; the densest point of a ray is a minimum;

@@ -1,7 +1,7 @@
-"""What an error looks like in the arrays of a comparison, and which planted faults look most alike.
+"""The signature of an error in the arrays of a comparison, and the planted faults whose signatures are most similar.
 
-An error in one formula leaves its traces downstream: some arrays are wrong, others right, and the wrong ones are off in
-a way of their own. Of each array that was given a *mark* is kept: whether it is wrong, how much of it relative to the
+An error in one formula leaves its traces downstream: some arrays are wrong, others right, and each wrong one is off in
+a characteristic way. Of each array that was given a *mark* is kept: whether it is wrong, how much of it relative to the
 others, whether it is off along itself (by a factor) or across, and in which columns. None of these depends much on how
 large the error is, or on the scene. The *signature* of a renderer is the mean of its marks over the scenes, with the
 scenes in which an array is wrong.
@@ -33,9 +33,9 @@ INTERMEDIATE = {
     "opacities2d": "opacities",
     "radii": "radii",
 }
-"""What a function can return in its meta, by gsplat's names."""
+"""The entries that a function can return in its meta, by gsplat's names."""
 GRADIENTS = {f"v_{array}": f"a gradient of {key}" for array, key in INTERMEDIATE.items() if array != "radii"}
-LEAST_SHARE = 1e-4  # relative error, of the largest of all arrays, below which a mark says no less
+LEAST_SHARE = 1e-4  # relative error, of the largest of all arrays, below which all errors have the same mark
 FAR = 2.0  # difference of common logarithms of sizes from which on it counts in full
 WEIGHTS = {"wrong": 1.0, "size": 0.5, "along": 1.0, "columns": 1.0}
 """Of the parts of a distance, each from 0 to 1. Chosen among a dozen by the scenes of seed 1, and judged on others."""

@@ -1,4 +1,4 @@
-"""Errors with a size: what a wrong renderer may have wrong, from which the signatures of errors are measured.
+"""Planted errors with a size, from which the signatures of errors are measured.
 
 :mod:`minisplat_ref.oracle.planted` has errors that the oracle must find; these are the ones that it must tell apart.
 Each changes one formula of a backend. A fault of a forward formula has its own derivative, so that its gradients are

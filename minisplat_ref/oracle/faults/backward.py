@@ -1,4 +1,4 @@
-"""Backends with a wrong gradient and right images, by a size."""
+"""Backends with right images and a wrong gradient, whose error has a given size."""
 
 from collections.abc import Callable
 from functools import wraps
