@@ -69,7 +69,7 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     Parameters
     ----------
     world : World
-        What to look at; +z is up for its ambient light.
+        The scene; +z is up for its ambient light.
     camera : Camera
         From where.
     supersampling : int
