@@ -1,4 +1,4 @@
-"""Importance of each Gaussian to the training views (Mini-Splatting, Sec. 3.2 and appendix E), and which carry most.
+"""Importance of each Gaussian to the training views (Mini-Splatting, Sec. 3.2 and appendix E), and the selection by it.
 
 The weight w = alpha T of a hit is a Gaussian's share of a pixel. Everything here is a sum, a maximum or a count of
 weights over the pixels of all training views. The Gaussian with the largest weight at a pixel *dominates* it.

@@ -1,9 +1,9 @@
-"""Visibility culling of Mini-Splatting2: draw each training view only with the Gaussians that matter to it.
+"""Visibility culling of Mini-Splatting2: render each training view only with the Gaussians that matter to it.
 
 A Gaussian is *visible* in a view if it belongs to the most important ones that together carry 0.99 of the view's blend
 weight (:func:`minisplat_ref.strategy.importance.collect_importance`). The table [N, V] of this visibility is measured
 now and then, with culling off, on the training views alone; in between, children inherit their parent's row. Left out:
-skipping the others when a view is drawn, which the renderer does.
+skipping the others when a view is rendered, which the renderer does.
 """
 
 import numpy as np
