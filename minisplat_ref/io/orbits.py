@@ -22,7 +22,7 @@ FULL_CIRCLE = 2.0 * math.pi
 LARGEST_GAP = math.radians(90.0)  # between neighbouring cameras; a larger one is not crossed
 SMOOTHING = math.radians(15.0)  # standard deviation of the weights by which cameras near an angle count
 MEAN_UP_WEIGHT = 0.02  # against the spread of horizontal edges, which is 1/2 all around and 0.1 along 70 degrees
-RADIUS_MIN = 0.1  # of the median: the angle of a camera nearer to the axis says nothing
+RADIUS_MIN = 0.1  # of the median: the angle of a camera nearer to the axis is arbitrary
 PARALLEL = 0.9  # length of the mean viewing direction, from which on the axes may meet behind the cameras
 
 
@@ -43,7 +43,7 @@ def orbit(
     width, height : int
         Image size, pixels.
     arc : float, optional
-        Angle that the path covers, radians, about the middle of what was photographed. Less than a full circle is
+        Angle that the path covers, radians, centred on the middle of the training cameras. Less than a full circle is
         travelled there and back. By default, what the training cameras cover, or the full circle.
 
     Returns
@@ -71,7 +71,7 @@ def orbit(
 
 
 class _Path(NamedTuple):
-    """Cameras in the cylinder about an axis, by which the path is drawn."""
+    """Cameras in cylindrical coordinates about an axis, which define the path."""
 
     target: Floats
     """[3] origin of the cylinder, world frame."""

@@ -89,7 +89,7 @@ class Header(NamedTuple):
 
 
 def n_rows_of(path: str | Path, name: str) -> int:
-    """Return how many rows the elements of a name have together, 0 if there are none, such as ``face``.
+    """Return the total number of rows of the elements of a name, such as ``face``; 0 if there are none.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def write_vertices(
 
 
 def open_ply(path: Path) -> BinaryIO:
-    """Open a file, or raise an InputError that says why it cannot be opened."""
+    """Open a file, or raise an InputError with the reason why it cannot be opened."""
     try:
         return path.open("rb")
     except OSError as error:
