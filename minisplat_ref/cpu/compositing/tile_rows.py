@@ -1,7 +1,7 @@
-"""Which part of a tile a Gaussian reaches, and its alpha there.
+"""The part of a tile that a Gaussian reaches, and its alpha there.
 
 The rows that the visible ellipse reaches are found strip by strip, so that a slanted ellipse covers a staircase of rows
-rather than its box. What all pixels of a line share is computed once, for all lines of the tile together.
+rather than its box. Terms that all pixels of a line share are computed once, for all lines of the tile together.
 
 Alpha is computed for all rows before any is blended. The exponential is a long chain of dependent operations, and
 blending is another. A processor hides their latency by executing other pixels out of order, and its window spans more
