@@ -19,7 +19,7 @@ class Crop(NamedTuple):
     view: str
     """Name of the view."""
     reason: str
-    """Why it is shown."""
+    """The reason why it is shown."""
     truth: Image8
     """[h, w, 3] photograph, sRGB."""
     renders: tuple[Image8, ...]
@@ -27,7 +27,7 @@ class Crop(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """A crop, and how much it holds of what was looked for."""
+    """A crop, and its score in the search."""
 
     score: float
     crop: Crop

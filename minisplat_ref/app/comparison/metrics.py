@@ -1,4 +1,4 @@
-"""What finished run folders say in numbers, and what the seeds of a recipe say together."""
+"""Metrics of finished runs, and their aggregates over seeds."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,11 @@ class Metric(NamedTuple):
     key: str
     """Name in compare.json."""
     title: str
-    """What it is, with its unit."""
+    """Its meaning, with the unit."""
     format: str
     """Of a value."""
     relation: Literal["ratio", "difference"] | None
-    """How a recipe is set against the first; decibels and SSIM have no meaningful ratio."""
+    """How a recipe is compared with the first; decibels and SSIM have no meaningful ratio."""
 
 
 METRICS = (
@@ -53,7 +53,7 @@ RunMetrics = Mapping[str, float | None]
 
 
 class Spread(NamedTuple):
-    """What several seeds give."""
+    """Aggregate over several seeds."""
 
     mean: float | None
     """None unless every run has a value."""
@@ -157,7 +157,7 @@ def first_to_reach(curve: Sequence[Mapping[str, Any]], psnr: float) -> Mapping[s
 
 
 def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[float | None, float | None]:
-    """Return what model, gradients and moments take at most before iteration ``end``, and from it on, MB.
+    """Return the peak memory of model, gradients and moments before iteration ``end``, and from it on, MB.
 
     None for a stage without records.
     """
@@ -173,7 +173,7 @@ def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[floa
 def densification_end(recipe: Mapping[str, Any]) -> float:
     """Return the iteration at which a recipe, as config.json describes it, has stopped cloning and splitting.
 
-    Mini-Splatting simplifies in this iteration; 3DGS continues with what it has. Infinite where there is no such end.
+    Mini-Splatting simplifies in this iteration; 3DGS continues with its Gaussians. Infinite where there is no such end.
     """
     events = [event for event in recipe["events"] if event["action"] == "clone_and_split"]
     stops = [math.inf if event["stop"] is None else event["stop"] * Fraction(event["factor"]) for event in events]
