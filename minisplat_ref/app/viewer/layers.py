@@ -1,4 +1,4 @@
-"""What of a view is shown: its colours, or a map of what they are made of."""
+"""The layers of a view that can be shown: its colours, or a map of their components."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ class Picture(NamedTuple):
 
     image: Image8
     caption: str
-    """What its colours mean, in a few words; empty for the colours themselves."""
+    """The meaning of its colours, in a few words; empty for the colours themselves."""
 
 
 class Drawn(NamedTuple):
@@ -50,7 +50,7 @@ class Layer(NamedTuple):
     """A way of looking at a view."""
 
     wants: frozenset[str]
-    """What it needs of the renderer, see :class:`minisplat_ref.rendering.Request`."""
+    """The outputs that it needs of the renderer, see :class:`minisplat_ref.rendering.Request`."""
     picture: Callable[[Drawn], Picture]
     channel: str = "rgb"
     """That the renderer must have."""
@@ -145,7 +145,7 @@ def draw(trained: Trained, camera: Camera, layer: str, time: float = 0.0) -> Pic
     Raises
     ------
     InputError
-        The renderer does not have what the layer shows.
+        The renderer does not have the channel that the layer shows.
     """
     wants = LAYERS[layer].wants
     settings = RenderSettings(
@@ -171,7 +171,7 @@ def find_bins(tape: Any) -> TileBins | None:
 
 
 def tile_loads(bins: TileBins) -> Ints:
-    """Return for each pixel [H, W] how many Gaussians its tile lists."""
+    """Return for each pixel [H, W] the number of Gaussians in its tile's list."""
     grid = bins.grid
     loads = np.diff(bins.tile_offsets).reshape(grid.n_tiles_y, grid.n_tiles_x)
     tiles = loads.repeat(grid.tile_height, axis=0).repeat(grid.tile_width, axis=1)
