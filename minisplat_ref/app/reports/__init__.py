@@ -1,4 +1,4 @@
-"""The report kit: what pages, plots and images of results are made of.
+"""The report kit: parts of pages, plots and images of results.
 
 :mod:`.page` and :mod:`.page_style` make one HTML file of cards, tables and panels, :mod:`.plots` draws curves as SVG
 and PNG in the colours of :mod:`minisplat_ref.interface.palette`, :mod:`.images` turns renders, errors and depths into
