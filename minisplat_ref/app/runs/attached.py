@@ -10,7 +10,7 @@ import runpy
 import sys
 import threading
 
-ORPHANED = 1  # exit code that nobody is left to read
+ORPHANED = 1  # exit code that no process reads
 
 
 def _end_with_parent() -> None:

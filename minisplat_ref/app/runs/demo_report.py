@@ -59,7 +59,7 @@ class ViewImages(NamedTuple):
     name: str
     """Name of the view."""
     caption: str
-    """What was measured on it."""
+    """The metrics measured on it."""
     truth: Image8
     """[H, W, 3] photograph, sRGB."""
     render: Image8

@@ -1,11 +1,10 @@
-"""Which scene a run belongs to: the cameras and photographs of its views, as ``cameras.json`` keeps them.
+"""The fingerprint of a run's scene: the cameras and photographs of its views, as ``cameras.json`` keeps them.
 
-Hashed are the pixels as they were loaded (downscaled, undistorted, composited, with their mask), not the files: they
-are what was trained on. A photograph that is saved again without loss, or a scene that is converted from COLMAP to
+Hashed are the pixels as they were loaded (downscaled, undistorted, composited, with their mask), not the files: the
+training used these pixels. A photograph that is saved again without loss, or a scene that is converted from COLMAP to
 transforms.json, is the same; another ``--downscale`` is not. It takes as long as reading the pixels once: from memory,
-or from disk where memory cannot hold them.
-A decoder that gives other pixels for the same JPEG makes another scene, and a training continued on it would indeed not
-end with the same bytes.
+or from disk where memory cannot hold them. A decoder that gives other pixels for the same JPEG makes another scene, and
+a training continued on it would indeed not end with the same bytes.
 
 Cameras are compared to nine digits: a product of matrices can differ in the last one between machines.
 """
@@ -35,7 +34,7 @@ Entries = Sequence[Mapping[str, Any]]
 
 
 def of_scene(scene: Scene) -> list[dict[str, Any]]:
-    """Return what ``cameras.json`` holds: every view with its camera, as in the files, and its photograph's hash."""
+    """Return the content of ``cameras.json``: every view with its camera, as in the files, and a photograph's hash."""
     views = (*scene.train_views, *scene.test_views)
     found = viewpoints.scene_viewpoints(scene)
     cameras = viewpoints.to_json([v._replace(camera=return_camera(v.camera, scene.frame)) for v in found])
@@ -64,7 +63,7 @@ def _hash_of_pixels(view: View) -> str:
 
 
 def read(folder: Path) -> Entries | None:
-    """Return the views that a run was trained on; None where the folder does not say.
+    """Return the views that a run was trained on; None where the folder does not have it.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """``mesh``: the surface of a run, fused from the depths that its training cameras show (after KinectFusion and 2DGS).
 
-The cameras render the run; photographs are not needed. A first pass over them finds where the surface lies, which says
-how large the grid has to be; a second fuses the depths (:mod:`minisplat_ref.mechanisms.fusion`).
+The cameras render the run; photographs are not needed. A first pass over them locates the surface, which determines the
+size of the grid; a second fuses the depths (:mod:`minisplat_ref.mechanisms.fusion`).
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ POINTS_PER_VIEW = 4_000  # in the first pass
 
 
 class Asked(NamedTuple):
-    """What the command line says."""
+    """The options of the command line."""
 
     run: Path
     depth: DepthKind = DepthKind.MEDIAN
@@ -67,7 +67,7 @@ class Opened(NamedTuple):
     frame: Frame
 
     def map_of(self, view: Viewpoint, kind: DepthKind) -> DepthMap:
-        """Return what a camera shows."""
+        """Return the image and the depth map of a camera."""
         return depth_map(self.trained, view_from(view.camera, time=view.time), kind)
 
     def camera_of(self, view: Viewpoint) -> Camera:

@@ -1,8 +1,8 @@
 """A part of a scene that is trained for itself: which photographs, which of their pixels, and where its Gaussians are.
 
 A part is two files, ``NAME.json`` and, beside it, ``NAME.npz`` with cameras, points and masks. They have all that a
-training needs of the scene besides its photographs: the model of a large scene is read by whoever plans its parts, and
-not again for each. Places are in the frame of the scene's files, on a plane: a point x has the coordinates
+training needs of the scene besides its photographs: the model of a large scene is read once, when its parts are
+planned, and not again for each. Places are in the frame of the scene's files, on a plane: a point x has the coordinates
 ``axes (x - origin)``.
 """
 
@@ -61,7 +61,7 @@ class Box(NamedTuple):
 
 
 class Region(NamedTuple):
-    """Where the first Gaussians of a part are."""
+    """The box of a part's first Gaussians."""
 
     plane: Plane
     box: Box
@@ -76,7 +76,7 @@ class Region(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What one block trains on."""
+    """The data that one block is trained on."""
 
     region: Region
     """The block with its surroundings."""
@@ -138,7 +138,7 @@ def read_part(path: Path, source: Path) -> Part:
     Raises
     ------
     InputError
-        A file is missing, or is not what it should be.
+        A file is missing or damaged.
     """
     region, content = read_region(path), read_json_object(path)
     try:
