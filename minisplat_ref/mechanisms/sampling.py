@@ -1,7 +1,7 @@
 """Sampling intervals of cameras, and images at other samplings.
 
-At scale z an image has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, which
-is what a sensor with larger pixels would have measured.
+At scale z an image has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, as a
+sensor with larger pixels would have measured it.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The cameras: what the optics of a :class:`~minisplat_ref.types.Camera` mean for points, pixels and the order.
+"""The cameras: the effect of a :class:`~minisplat_ref.types.Camera`'s optics on points, pixels and the order.
 
 All functions are of the camera's frame (OpenCV axes) and in float64. A model never sees the pose, so a renderer
 differentiates with respect to it by the chain rule through ``x = R mu + t`` alone.

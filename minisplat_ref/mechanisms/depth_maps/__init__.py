@@ -1,4 +1,4 @@
-"""Depth maps: their normals, their smoothing, and whether those of several views agree.
+"""Depth maps: their normals, their smoothing, and the agreement of several views.
 
 A relative brings the camera z [H, W] of views, 0 where they show nothing, and their cameras. :mod:`.normals` has the
 normals by central differences with their gradient; :mod:`.bilateral` smooths a map, with its gradient, without blurring

@@ -18,7 +18,7 @@ Window = tuple[slice, slice]
 
 
 class BilateralWidths(NamedTuple):
-    """How far neighbours count."""
+    """Widths of the filter."""
 
     radius: int = 3
     """Pixels on either side of the window's middle."""

@@ -1,4 +1,4 @@
-"""What a feature bank is: a function from an image to maps of features, and its gradient."""
+"""Feature banks: functions from an image to maps of features, and their gradients."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

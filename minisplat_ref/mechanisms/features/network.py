@@ -1,4 +1,4 @@
-"""Features of a convolutional network whose weights the user brings; nothing is downloaded, and none are shipped.
+"""Features of a convolutional network with weights from the user; none are downloaded or shipped.
 
 The file is an .npz of plain arrays, for convolutions k = 1, 2, ... in their order, each followed by a ReLU:
 

@@ -1,4 +1,4 @@
-"""How shaded surfels are trained: the stages of shading, and how normals are helped to spread (Ref-Gaussian)."""
+"""Training of shaded surfels: the stages of shading, and the propagation of normals (Ref-Gaussian)."""
 
 from functools import partial
 

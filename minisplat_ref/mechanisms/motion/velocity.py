@@ -1,6 +1,6 @@
 """The velocity of a warp in three forms, and its integral over time.
 
-A *forward* warp takes a place of time 0, the canonical place y, to where it is at time t: ``x = W(y, t)``, with the
+A *forward* warp maps a place at time 0, the canonical place y, to its place at time t: ``x = W(y, t)``, with the
 Jacobian ``J = dW/dy``. A *backward* warp w takes the place x at time t to y, with ``J_w = dw/dx``. If each is the
 inverse of the other, then
 
@@ -42,7 +42,7 @@ class Warp(NamedTuple):
         return self.shifts.shape[1]
 
     def at(self, places: Floats, time: float) -> Floats:
-        """Return where canonical places [N, 3] are at a time."""
+        """Return canonical places [N, 3] at a given time."""
         return places + self._field(places, powers(time, self.degree))
 
     def rate(self, places: Floats, time: float) -> Floats:
@@ -120,7 +120,7 @@ def invert(warp: Warp, places: Floats, time: float) -> Floats:
 
 
 def integrate(velocity: Callable[[Floats, float], Floats], start: Floats, time: float, step: float, n: int) -> Floats:
-    """Return where places are after a time, by the classical Runge-Kutta method of fourth order.
+    """Return places after a time, by the classical Runge-Kutta method of fourth order.
 
     ::
 

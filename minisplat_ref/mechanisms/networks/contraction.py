@@ -5,7 +5,7 @@
     c(x) = x                        where |x| <= 1
            (2 - 1 / |x|) x / |x|    elsewhere
 
-It is in NumPy alone: a pass over three numbers a row is nothing beside a network.
+It is in NumPy alone: a pass over three numbers a row is negligible compared with a network.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Rays through pixels, what they meet, and blend statistics: what the ray tracers of Gaussians share.
+"""Rays through pixels, their hits, and blend statistics, which the ray tracers of Gaussians share.
 
 All floats are float64: a thin Gaussian far away leaves float32 no digit of its distance. P rays, N Gaussians, H hits.
 """
@@ -69,7 +69,7 @@ class RayGradient(NamedTuple):
     means: Floats
     """[N, 3]."""
     shapes: Floats
-    """[N, ...] with respect to what the extension makes of quaternions and scales."""
+    """[N, ...] with respect to the shapes that the extension makes of quaternions and scales."""
     opacities: Floats
     """[N]."""
     colors: Floats

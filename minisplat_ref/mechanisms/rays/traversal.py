@@ -37,7 +37,7 @@ class Limits(NamedTuple):
 
 
 class RayTree(NamedTuple):
-    """What rays may meet, in the order of a tree's leaves: whole Gaussians, or parts of them such as triangles."""
+    """The primitives of a tree, in the order of its leaves: whole Gaussians, or parts of them such as triangles."""
 
     records: Floats
     """[N', C] of those that can be seen at all; the column ``OPACITY`` is the opacity."""

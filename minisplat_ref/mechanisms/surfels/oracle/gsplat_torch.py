@@ -2,8 +2,9 @@
 
 gsplat tests its kernels against ``_torch_impl_2dgs``; that file and ``depth_to_normal`` are loaded alone, because
 importing the package looks for CUDA. They compute projection, alphas, colours, opacities, normals and surface normals,
-and torch differentiates them. What gsplat has in CUDA only is ours: which hits a pixel blends, from the reference's
-thresholds (no gradient goes through it), and the median depth and the distortion, in a few lines of torch each.
+and torch differentiates them. The parts that gsplat has in CUDA only are ours: which hits a pixel blends, from the
+reference's thresholds (no gradient goes through it), and the median depth and the distortion, in a few lines of torch
+each.
 
 Its normals are multiplied by the third scale, which the kernels leave out: give it third scales of one.
 """
