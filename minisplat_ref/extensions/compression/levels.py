@@ -16,7 +16,7 @@ from minisplat_ref.types import Ints
 
 N_LEVELS = 13
 DEFAULT = 5
-SMALL = 0.1  # quantile of the Gaussians' middle standard deviations that stands for the small ones
+SMALL = 0.1  # quantile of the Gaussians' middle standard deviations that represents the small ones
 
 
 class Exponents(NamedTuple):

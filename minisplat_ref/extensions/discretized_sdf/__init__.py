@@ -23,9 +23,9 @@ Training begins with the foreground on a sphere; its stages of shading are those
 
 ``docs/FAMILY.md`` has the measured figures.
 
-The PLY has the distances, and as ``opacity`` what follows from them, for other viewers; gamma is in ``shared.npz``
-beside it, as ln(1 / gamma), the environment likewise. Clones and children of a split inherit s, which a tangent plane
-does not change; faint surfels are pruned by their opacity, and a reset of opacities raises |s|.
+The PLY has the distances, and as ``opacity`` the opacities that follow from them, for other viewers; gamma is in
+``shared.npz`` beside it, as ln(1 / gamma), the environment likewise. Clones and children of a split inherit s, which a
+tangent plane does not change; faint surfels are pruned by their opacity, and a reset of opacities raises |s|.
 
 This deviates from the paper as follows. The foreground is the half of the points that is nearest to their median, and
 its radius, the weight of the projection, the first gamma and all rates are ours. The inverse of D is interpolated.

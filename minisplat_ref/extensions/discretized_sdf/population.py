@@ -1,4 +1,4 @@
-"""Surfels with a signed distance, how they start, and what they share: gamma, beside the light."""
+"""Surfels with a signed distance, their start, and their shared parameters: gamma, beside the light."""
 
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -28,7 +28,7 @@ FRONT_REACH = 2.5  # k of the fan of 8 sides that is nearest to a Gaussian seen 
 
 
 class FanShape(NamedTuple):
-    """How Gaussians become fans.
+    """Options of turning Gaussians into fans.
 
     The default reach is larger than ``FRONT_REACH``: a scene of many shows holes more than it shows fans that overlap.
     """

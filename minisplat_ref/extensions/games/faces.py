@@ -42,7 +42,7 @@ class FaceGaussians(NamedTuple):
 
 
 class FaceFrames(NamedTuple):
-    """What follows from the corners alone."""
+    """The quantities that follow from the corners alone."""
 
     quats: Floats
     """[N, 4] of R."""
@@ -109,7 +109,7 @@ def corner_weights(corner_logits: Floats) -> Floats:
 
 
 def on_own_faces(gaussians: Gaussians, rng: np.random.Generator) -> FaceGaussians:
-    """Return each Gaussian in the middle of a face of its own, which gives it its rotation, and its scales for rho = 1.
+    """Return one Gaussian in the middle of each face, with the face's rotation, and its scales for rho = 1.
 
     :func:`place` then returns its mean, its rotation, and its second and third scale; along its first axis it is flat.
     With the mean m, and s2 and s3 along r2 and r3, the corners are

@@ -23,7 +23,7 @@ from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
 
 class FaceTape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     splatting: Any
     gaussians: FaceGaussians

@@ -28,7 +28,7 @@ RETURN_MAX = 0.5  # pixels by which the flow there and back may miss
 
 
 class Flow(NamedTuple):
-    """Where the pixels of one photograph are in another."""
+    """The places of one photograph's pixels in another."""
 
     motion: Floats
     """[H, W, 2] along x and y, pixels."""
@@ -79,7 +79,7 @@ def _step(first: Floats, moved: Floats) -> Floats:
     xx, yy = xx + DAMPING, yy + DAMPING
     determinant = xx * yy - xy * xy
     step = np.stack([xy * ye - yy * xe, xy * xe - xx * ye], axis=2) / determinant[..., None]
-    return np.clip(step, -1.0, 1.0)  # beyond a pixel the linear model says nothing
+    return np.clip(step, -1.0, 1.0)  # beyond a pixel the linear model is invalid
 
 
 def _in_window(a: Floats, b: Floats) -> Floats:

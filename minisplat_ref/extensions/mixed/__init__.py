@@ -38,7 +38,7 @@ This deviates from the paper as follows. A hull is placed by the mean of its ver
 first; what makes a triangle a line is its altitude instead of Pearson's correlation, which depends on the axes; changes
 to more vertices are not the paper's. Primitives are as thick as training makes them, where surfels are flat; so a depth
 is that of the best plane through a primitive, which for a flat one is its own. A child of a split keeps its parent's
-vertices, as in the paper, and size limits look at deviations alone.
+vertices, as in the paper, and size limits consider deviations alone.
 """
 
 from minisplat_ref.extensions.extension import Extension

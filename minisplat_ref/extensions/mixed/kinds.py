@@ -6,7 +6,7 @@ latter; it depends on the axes, and of points along one of them it is 0 or undef
 smallest altitude is below a share of a deviation.
 
 To more, which the paper does not have: a needle becomes a line along it, and a large disc a triangle in its plane.
-What a hull covers of its plane, the integral of its response over o, is by Steiner's formula::
+The area of a hull, the integral of its response over o, is by Steiner's formula::
 
     integral = s_1 s_2 (A + P sqrt(pi / 2) + 2 pi)
 

@@ -68,7 +68,7 @@ def start_networks(state: TrainState, iteration: Iteration) -> None:
     """Replace opacity and colour by features: static ones that are the colours, and view features of zero.
 
     The networks begin with the outputs that the Gaussians had, as nearly as their last layers can be fitted, and
-    without an influence of the place. The paper does not say how its networks begin.
+    without an influence of the place. The paper does not define the start of its networks.
     """
     g, n = state.gaussians, n_rows(state.gaussians)
     features = np.concatenate([g.sh_dc, np.zeros((n, N_VIEW), g.means.dtype)], axis=1)

@@ -75,7 +75,7 @@ def fit_codes(vectors: Floats, n_codes: int) -> Floats:
 
 
 def unit_quats(quats: Floats) -> Floats:
-    """Return quaternions [N, 4] of length 1 with w >= 0, one of the two that stand for each rotation."""
+    """Return quaternions [N, 4] of length 1 with w >= 0, one of the two that represent each rotation."""
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     return unit * np.where(unit[:, :1] < 0, unit.dtype.type(-1), unit.dtype.type(1))
 

@@ -19,7 +19,7 @@ A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The cor
 spans, whose ellipse is the Gaussian. Every affine edit is carried exactly.
 
 This deviates from the paper, which recovers a Gaussian from three vertices by Gram-Schmidt and so loses shear; here all
-corners are fitted, and ``claims polygons/edits`` measures the paper's way beside it. A ray has any number of hits,
+corners are fitted, and ``claims polygons/edits`` measures the paper's way, too. A ray has any number of hits,
 sorted exactly. The thickness is 1e-5 where training starts and has no effect on an image; it keeps its ratio under an
 edit. A Gaussian is flattened along whichever axis is its thinnest. Training starts from balls, whose planes are chosen
 at random; its loss and schedule are those of 3DGS. Hits of alpha below ``alpha_min`` = 1/255 do not count.

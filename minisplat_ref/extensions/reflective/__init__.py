@@ -27,9 +27,9 @@ mirrors spread (:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on n
 
 This deviates from the paper as follows. Reflected rays meet the surfels, not a mesh that is extracted now and then, and
 V is what comes through. The environment has 32 x 64 texels; its averages are exact matrices instead of samples, and
-what a matte surface sees is held by nine harmonics. The date of occlusion, the strength of the disturbance and what
-counts as a mirror are ours. Light is linear and shown as sRGB. Left out are light that is reflected twice, and the
-environment as the background of the image.
+nine harmonics hold the light on a matte surface. The date of occlusion, the strength of the disturbance and what counts
+as a mirror are ours. Light is linear and shown as sRGB. Left out are light that is reflected twice, and the environment
+as the background of the image.
 """
 
 from minisplat_ref.extensions.extension import Extension

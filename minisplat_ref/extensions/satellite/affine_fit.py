@@ -105,9 +105,9 @@ def fit_affine(
 
 
 def frame_of(rpcs: list[RPC], size: tuple[int, int], altitudes: tuple[float, float]) -> Frame:
-    """Return the frame of a scene: centred on what the middle of the first image sees, its half diagonal is 1.
+    """Return the frame of a scene: centred on the middle of the first image, with a half diagonal of 1.
 
-    The origin is at the lowest altitude, as which the renderer counts what is nearly transparent.
+    The origin is at the lowest altitude, which the renderer assigns to nearly transparent pixels.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def begin_transparent(state: TrainState, iteration: Iteration, *, opacity: float
 
 
 def hold_sky(state: TrainState, iteration: Iteration) -> None:
-    """Keep the light in shadows between none and the sun's: while surfaces are unsettled, its gradient knows no end."""
+    """Keep the light in shadows between none and the sun's: while surfaces are unsettled, its gradient is unbounded."""
     np.clip(state.shared[IN_SHADOW], 0, 1, out=state.shared[IN_SHADOW])
 
 

@@ -5,7 +5,7 @@ ratios of cubics of them::
 
     line = (a . m(P, L, H)) / (b . m(P, L, H)) LINE_SCALE + LINE_OFF,   sample likewise by c and d
 
-m has 20 monomials, so a camera has 80 coefficients. They stand in a GeoTIFF's metadata, in a text ``_RPC.TXT`` or in an
+m has 20 monomials, so a camera has 80 coefficients. They are in a GeoTIFF's metadata, in a text ``_RPC.TXT`` or in an
 ``.RPB`` of the same numbers. Pixel (0, 0) of an RPC is the centre of the first pixel; here its centre is at 0.5.
 """
 

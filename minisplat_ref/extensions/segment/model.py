@@ -1,4 +1,4 @@
-"""The model that the commands work on: primitives, who draws them, cameras, and files with labels."""
+"""The model that the commands work on: primitives, their renderer, cameras, and files with labels."""
 
 from collections import namedtuple
 from pathlib import Path
@@ -28,7 +28,7 @@ class Subject(NamedTuple):
     file: Path
     """Its PLY."""
     label: Label
-    """What the file says about how it is drawn."""
+    """The label of the file."""
     population: Any
     """As the file holds it."""
     placed: Any

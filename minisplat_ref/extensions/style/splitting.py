@@ -1,9 +1,9 @@
-"""What makes room for patterns: large Gaussians are split, long ones shortened, and those that want two colours split.
+"""Splits that make room for patterns: of large Gaussians, long ones, and ones that are pulled to two colours.
 
 A Gaussian becomes a grid of children in the plane of its two longest axes. With two children per axis, each at a
 distance d from the middle and with the standard deviation s', the variance stays where ``d^2 + s'^2 = s^2``; in a row
-of four, at d and 3 d, where ``5 d^2 + s'^2 = s^2``. So the children leave no holes, and what they cover is what the
-parent covered. The shortest axis stays.
+of four, at d and 3 d, where ``5 d^2 + s'^2 = s^2``. So the children leave no holes, and cover the same area as the
+parent. The shortest axis stays.
 """
 
 import math

@@ -31,7 +31,7 @@ N_PIXELS = 200_000  # of the photographs, from which their colours' mean and cov
 
 
 class Plan(NamedTuple):
-    """How to style."""
+    """Settings of the styling."""
 
     bank: FeatureBank = CLASSICAL
     weights: FeatureWeights = FeatureWeights(NNFM_AROUND, CONTENT_CLASSICAL)
@@ -43,7 +43,7 @@ class Plan(NamedTuple):
 
 
 class Styled(NamedTuple):
-    """What comes of it."""
+    """The result."""
 
     gaussians: Gaussians
     recolored: Gaussians

@@ -160,7 +160,7 @@ def raw_normals(tangent: Floats) -> Floats:
 
 
 def _read(tile: TileHits, texels: Floats) -> tuple[Floats, Corners]:
-    """Return what the hits of a tile read, [G, P, 8], and where."""
+    """Return the values that the hits of a tile read, [G, P, 8], and their places."""
     place: SurfelPlace = tile.hit.place
     # Misses may lie anywhere: they read the middle.
     u, v = (np.where(tile.alphas > 0, values, 0) for values in (place.u, place.v))

@@ -1,6 +1,7 @@
-"""What a network's output does to opacities and coefficients, each beside its gradient.
+"""The effect of a network's output on opacities and coefficients, each beside its gradient.
 
-All of it is in NumPy alone: a few operations per Gaussian, beside a network and a hash grid that have kernels.
+All of it is in NumPy alone: a few operations per Gaussian are negligible compared with the network and the hash grid,
+which have kernels.
 """
 
 from typing import NamedTuple
