@@ -1,6 +1,6 @@
 """Agreement of backends: each stage of a model on the same input, compared with the first backend.
 
-Gradients are checked against differences of the very backend that computes them, so what is wrong in both, such as an
+Gradients are checked against differences of the very backend that computes them, so an error in both, such as a wrong
 order of Gaussians, passes there. It does not pass here, unless all backends are wrong in the same way.
 """
 

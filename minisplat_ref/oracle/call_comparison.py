@@ -27,7 +27,7 @@ POSE = "viewmats"
 
 
 class CallScene(NamedTuple):
-    """The arguments of one call, and what its images are differentiated along."""
+    """The arguments of one call, and the cotangents of its images."""
 
     name: str
     what: str
@@ -46,7 +46,7 @@ class StageArray(NamedTuple):
     what: str
     """Shape and meaning, for the README of golden vectors."""
     part: Callable[[np.ndarray], np.ndarray] = np.asarray
-    """Returns what of it is compared."""
+    """Returns the part of it that is compared."""
     is_of_rows: bool = False
     """Whether rows of Gaussians are compared only where ours has a value; culled rows are never read."""
 
@@ -143,10 +143,10 @@ def choose_renderer(call: Call, name: str, dtype: str | None = None, arrays: str
         ``cpu``, ``cpu-exact``, ``reference``, ``planted:ERROR``, ``gsplat-torch``, ``package.module:function``, or a
         folder of arrays.
     dtype : str, optional
-        ``"float32"`` or ``"float64"``: what is computed in. By default float64 for ours and gsplat's torch functions,
-        float32 for the others.
+        ``"float32"`` or ``"float64"``, the dtype of the computation. By default float64 for ours and gsplat's torch
+        functions, float32 for the others.
     arrays : str, optional
-        ``"numpy"`` or ``"torch"``: what a function is called with; by default what its module imports.
+        ``"numpy"`` or ``"torch"``, the kind of a function's arguments; by default the one that its module imports.
 
     Raises
     ------

@@ -111,7 +111,7 @@ class InnerProduct(NamedTuple):
 
     input: str
     size: float
-    """Sum of the sizes of its terms, so that a direction that happens to cancel is not judged by what it leaves."""
+    """Sum of the sizes of its terms, so that a direction that happens to cancel is not judged by the remainder."""
     error: float
     """Difference between the two sides, relative to ``size``."""
     step: float
@@ -192,7 +192,7 @@ def settled_derivative(
 
     For functions that do not report the sides of their thresholds: a kink or a jump inside the stencil
     changes the two estimates by different amounts. They agree if they differ by less than ``SETTLED`` of the larger, or
-    by what rounding explains.
+    by the rounding error.
     """
     size = max(float(np.max(np.abs(output), initial=0)) for output in function(*inputs).outputs)
     estimates = [derivative(function, inputs, index, direction, steps[0])]

@@ -71,7 +71,7 @@ def loss_cases(
 def loss_stage(
     term: LossTerm, backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator
 ) -> Stage | None:
-    """Return a term as a function of what it depends on; None if it is zero and depends on nothing.
+    """Return a term as a function of its inputs; None if it is zero and depends on nothing.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ def model_cases(
 
 
 def model_settings(conventions: Conventions) -> tuple[Setting, Setting, np.random.Generator]:
-    """Return the scene of the Jacobians, that of the inner products, and the generator of what follows."""
+    """Return the scene of the Jacobians, that of the inner products, and the generator for the rest."""
     rng = np.random.default_rng(SEED)
     return tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3), rng
 

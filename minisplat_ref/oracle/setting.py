@@ -1,4 +1,4 @@
-"""A scene on which to test gradients: small, and placed by hand where it matters.
+"""A small scene for testing gradients, with the decisive positions set by hand.
 
 It has a clamped hit, a pixel that stops early, a mean outside the clamp of the Jacobian on either axis, a colour below
 zero, a principal point off centre and a rotated camera: every branch of every gradient is taken. The Jacobian's limits

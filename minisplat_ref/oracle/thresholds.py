@@ -1,4 +1,4 @@
-"""Pixels at a threshold: where rounding decides whether a hit counts, or which of two is in front, and how much.
+"""Pixels at a threshold, where rounding decides whether a hit counts or which of two is in front, and the effect.
 
 A renderer is full of comparisons, and its image or its gradient jumps at each of them:
 

@@ -218,7 +218,7 @@ class Margins(NamedTuple):
     median: float
     """Of the same from one half."""
     place: float
-    """Of a pixel coordinate, how far it may be off; a hit's alpha changes with it as its Gaussian is steep there."""
+    """The error of a pixel coordinate; a hit's alpha changes with it in proportion to the slope of its Gaussian."""
     order: float
     """Of the depth of a hit from that of the one before; those that are one float32 are always near enough."""
 

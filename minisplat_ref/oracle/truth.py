@@ -6,7 +6,7 @@ transmittance is a product. This gives error figures for the float64 reference, 
 project in float64, and for the textbook's formulas in float32, which are the reference on float32 data:
 ``R mu + t``, ``A Sigma A^T``, ``a c - b^2``.
 
-A relative error is divided by the condition number of what is computed, the factor by which any formula may enlarge
+A relative error is divided by the condition number of the quantity, the factor by which any formula may enlarge
 the rounding of its input: for positions the distance to the world's origin over the depth, for conics that times the
 condition number of the projected covariance.
 """

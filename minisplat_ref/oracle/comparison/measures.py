@@ -1,6 +1,6 @@
 """The difference of two arrays, apart from values that rounding decides, and the effect of other bounds on the image.
 
-Boxes and tile lists differ between renderers for good reasons; what counts is whether the image does. So the reference
+Boxes and tile lists differ between renderers for good reasons; only a difference of the image counts. So the reference
 renders the truth's footprints once more, within the other renderer's bounds or in its order.
 """
 

@@ -212,7 +212,7 @@ def choose_function(name: str, dtype: str | None, profile: str | None, arrays: s
     profile : str, optional
         Key of ``PROFILES``: its rules; by default those of gsplat's main branch.
     arrays : str, optional
-        ``"numpy"``, ``"torch"`` or ``"jax"``; by default what its module has imported.
+        ``"numpy"``, ``"torch"`` or ``"jax"``; by default the kind that its module has imported.
 
     Raises
     ------

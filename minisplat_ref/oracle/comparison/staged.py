@@ -94,7 +94,7 @@ class Row(NamedTuple):
     note: str = ""
     """One line."""
     marks: Mapping[str, Mark] = NOTHING
-    """What is wrong with each array that was given."""
+    """The error of each array that was given."""
 
 
 def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
@@ -150,7 +150,7 @@ def excess(row: Row) -> float:
 
 
 def _relation(renderer: ComparedRenderer, row: Row, first: Row) -> str:
-    """Say how a difference is related to the first one; return nothing if neither can cause the other.
+    """Describe how a difference is related to the first one; return nothing if neither can cause the other.
 
     It may follow from the first if it is computed from the wrong values; if the truth is the input of every stage, this
     is possible only in the view. Two results of one stage are wrong independently.

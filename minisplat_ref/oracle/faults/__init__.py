@@ -2,7 +2,7 @@
 
 :mod:`minisplat_ref.oracle.planted` has errors that the oracle must find; these are the ones that it must tell apart.
 Each changes one formula of a backend. A fault of a forward formula has its own derivative, so that its gradients are
-those of what it computes. Most have a size, such as the factor by which a gradient is off: the table of signatures is
+consistent with its images. Most have a size, such as the factor by which a gradient is off: the table of signatures is
 measured at one size, and judged at others (:mod:`minisplat_ref.oracle.comparison.signatures`).
 """
 

@@ -58,7 +58,7 @@ def export(path: str | Path, scenes: Mapping[str, Golden]) -> None:
 
 
 def load(path: str | Path) -> dict[str, Golden]:
-    """Read what :func:`export` wrote, and check it: format, version, hashes, names, shapes, dtypes.
+    """Read the files of :func:`export`, and check them: format, version, hashes, names, shapes, dtypes.
 
     Parameters
     ----------

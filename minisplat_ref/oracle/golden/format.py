@@ -385,7 +385,7 @@ def readme(scenes: Mapping[str, Golden]) -> str:
 
 
 def convention_words() -> dict[str, str]:
-    """What each field of :class:`Conventions` means, in the words of its documentation, by its name or names."""
+    """The meaning of each field of :class:`Conventions`, from its documentation, by its name or names."""
     words: dict[str, str] = {}
     _, _, attributes = inspect.cleandoc(Conventions.__doc__ or "").partition("----------\n")
     for line in attributes.splitlines():

@@ -125,7 +125,7 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     Returns
     -------
     Golden
-        Arrays of the role "input", except what depends on a renderer.
+        Arrays of the role "input", except those that depend on a renderer.
     """
     rng = np.random.default_rng((seed, *recipe.name.encode()))
     size, center = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point)

@@ -64,9 +64,9 @@ def from_function(
     name : str, optional
         For reports.
     arrays : {"numpy", "torch", "jax"}, optional
-        What to call it with; by default what its module has imported.
+        The kind of its arguments; by default the one that its module has imported.
     dtype : {"float32", "float64"}
-        What it computes in.
+        The dtype of its computation.
     profile : Conventions
         Its rules, where the scenes leave a choice: how alpha is clamped, for example.
 
