@@ -58,7 +58,7 @@ def extension_cases(
     repeats : int
         Turns of each row; the references, which give the answers, take one.
     report : callable
-        Called with a line on what is being done.
+        Called with a line about the current step.
 
     Returns
     -------

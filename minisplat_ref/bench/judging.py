@@ -43,7 +43,7 @@ class Verdict(NamedTuple):
     n_flips: int
     """Pixels at thresholds with an error above the bound."""
     n_wrong: int
-    """Pixels with an error above the bound and above what their thresholds can explain."""
+    """Pixels with an error above the bound and above the effect of their thresholds."""
     gradient: float
     """Largest relative L2 error of any parameter's gradient."""
     quiet_gradient: float

@@ -22,7 +22,7 @@ class Passes(NamedTuple):
     """A forward pass and its backward pass."""
 
     forward: Callable[[Gaussians, Camera, Conventions, Backend], tuple[Floats, Any]]
-    """From parameters to the image [H, W, 3], and what ``backward`` needs."""
+    """From parameters to the image [H, W, 3], and the values that ``backward`` needs."""
     backward: Callable[[Any, Floats], Gaussians]
     """From that and the image's derivative to the parameters'."""
 
