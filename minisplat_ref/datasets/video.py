@@ -1,8 +1,8 @@
 """Photographs from a video: the sharpest of every few frames.
 
 A hand that holds a camera moves unevenly, so of neighbouring frames some are sharp and some are blurred. Sharpness is
-the mean square of the Laplacian of the brightness: between frames of one place it falls with blur, while its value says
-nothing between places.
+the mean square of the Laplacian of the brightness: between frames of one place it falls with blur, while values of
+different places cannot be compared.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The true surface of a synthetic scene, and how far Gaussians are from it: the Chamfer distance.
+"""The true surface of a synthetic scene, and the Chamfer distance of Gaussians from it.
 
 Of a folder that ``minisplat-ref synthetic`` has written, the depth of every pixel is known. The training views' pixels
 show points of the true surface, which are dense where many views look, or from near by.

@@ -47,7 +47,7 @@ class World(NamedTuple):
     ambient_below: Floats
     """[3] linear RGB that reaches a surface facing down."""
     sky: Callable[[Floats], Floats] | None
-    """Unit directions [n, 3] -> linear RGB [n, 3] of what lies at infinity; None where the world is closed."""
+    """Unit directions [n, 3] -> linear RGB [n, 3] of the light from infinity; None where the world is closed."""
 
 
 class TracedView(NamedTuple):

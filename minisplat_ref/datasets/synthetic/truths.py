@@ -71,7 +71,7 @@ def noisy_sphere(rng: np.random.Generator) -> Setting:
 
 
 def facing_spheres(rng: np.random.Generator) -> Setting:
-    """Two balls, nearly touching: what one hides of the other is seen from the sides alone."""
+    """Two balls, nearly touching: the part of one that the other hides is seen only from the sides."""
     lattice = random_lattice(rng)
     marble = Noise("#7a2848", "#f2c48d", np.full(3, 0.2), lattice, contrast=2.2)
     x = 0.4 + 0.5 * GAP
