@@ -252,7 +252,7 @@ def find_refuted(
     cameras : sequence of Camera
         Of all views.
     depth_maps : sequence of ndarray of shape (H, W)
-        Camera z of what each view sees, world units; 0 where it sees nothing.
+        Camera z of the surface in each view, world units; 0 where there is none.
     tolerance : float
         Relative difference of two depths of the same surface.
 

@@ -93,7 +93,7 @@ def indoor(stats: ImportanceStats) -> Floats:
 def outdoor(stats: ImportanceStats) -> Floats:
     """Return the importance [N] for outdoor scenes: mean weights per touched pixel, added up over the views.
 
-    Only views in which the Gaussian dominates a pixel count; how many pixels it covers there does not.
+    Only views in which the Gaussian dominates a pixel count; the number of pixels that it covers there does not.
     """
     return stats.mean_weight_sum
 

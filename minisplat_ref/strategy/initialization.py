@@ -27,7 +27,7 @@ def may_be_inside(points: Floats, camera: Camera) -> Bools:
     """Return for each point [P, 3] whether a camera may have it inside its image, [P]; of a pinhole, whether it has.
 
     Lenses are not known here (:mod:`minisplat_ref.mechanisms.cameras` is a layer above), so a camera with optics
-    counts as seeing all that its kind may: a fisheye and parallel rays every point, others what is in front of them.
+    counts as seeing all that its kind may: a fisheye and parallel rays every point, others the points in front of them.
     """
     x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
     is_in_front = z > 0

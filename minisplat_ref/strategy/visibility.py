@@ -42,8 +42,8 @@ def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
 def find_seen_by_few(is_visible: Bools, min_views: int) -> Bools:
     """Return which Gaussians are visible in fewer than ``min_views`` training views.
 
-    Depth from one view is a guess; the released code removes what fewer than two views see. In a scene with two views
-    this would leave next to nothing, so at most half of the views, rounded up, are required.
+    Depth from one view is a guess; the released code removes Gaussians that fewer than two views see. In a scene with
+    two views this would leave next to nothing, so at most half of the views, rounded up, are required.
 
     Parameters
     ----------
