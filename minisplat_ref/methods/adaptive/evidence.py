@@ -10,7 +10,7 @@ r = photograph - rendering by a few fields b_k, ``r = sum_k x_k b_k``:
 The x of a photograph are fitted to its left half by least squares and judged on its right half, and vice versa. Noise
 and the remaining errors of the scene differ from half to half, and worsen the other half; an exposure and a pose are
 the same in both, and improve it. The x that explains all photographs together best belongs to the scene and not to
-them; it is what the comparison starts from:
+them; the comparison starts from it:
 
     gain of a photograph = 10 log10 (before / after)
     before = sum over halves |r - common x b|^2,   after = sum over halves |r - (x of the other half) b|^2

@@ -1,4 +1,4 @@
-"""Exposure of each photograph, which ``adaptive`` switches on where the photographs show that they need it.
+"""Exposure of each photograph, which ``adaptive`` switches on where the photographs are evidence for it.
 
 After a few hundred iterations the scene is a blur of the right brightness. If the gain of one half of a photograph
 explains the other half (:mod:`minisplat_ref.methods.adaptive.evidence`), the camera has changed its exposure, unless

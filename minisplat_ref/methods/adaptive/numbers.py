@@ -39,8 +39,8 @@ recorded for 24."""
 VIEWS_PER_COEFFICIENT = 1.5
 """Training views for each coefficient of a channel of the colour. Fewer are a matter of taste (G)."""
 VARIATION_MIN = 4 / 255
-"""Standard deviation of a degree's part of the colour, out of 1, below which the degree is removed: what hardly shows
-in photographs is not worth its numbers. Without this rule the room has 309,102 numbers, not 224,855, and 27.57 dB,
+"""Standard deviation of a degree's part of the colour, out of 1, below which the degree is removed: a degree that is
+hardly visible is not worth its parameters. Without this rule the room has 309,102 numbers, not 224,855, and 27.57 dB,
 not 27.59 (B)."""
 
 # --- measurement, the next size, and the end ---
@@ -65,7 +65,7 @@ room loses 0.2 dB (B)."""
 COOLING_LAST, COOLING_LAST_PER_EXTENT = 0.1, 0.01
 """Factors of the rates at the end of the cool-down, and of those per unit of the extent. No reason recorded."""
 
-# --- what the photographs need ---
+# --- calibrations ---
 
 SKY_STEP = 100
 """Iteration in which a sky is considered. No reason recorded for 100; large Gaussians have covered it by then
@@ -105,7 +105,7 @@ SKY_VIEWS_MAX = 24
 SKY_VIEWS_MIN = 4
 """Photographs that must show something behind the scene: two to fit, two to judge."""
 OPEN = 0.5
-"""Transmittance above which a pixel shows what is behind the scene. No reason recorded."""
+"""Transmittance above which a pixel shows the background. No reason recorded."""
 OPEN_MIN = 0.005
 """Fraction of a photograph's pixels that must be open: fewer are no evidence."""
 

@@ -1,4 +1,4 @@
-"""Pruning of ``adaptive``: in slices, while the rates fall, it removes what the photographs would hardly miss.
+"""Pruning of ``adaptive``: in slices, while the rates fall, Gaussians that the photographs would hardly miss.
 
 The error falls because the rates do. The contribution of most Gaussians to the images is then known:
 :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each of them, in one pass over

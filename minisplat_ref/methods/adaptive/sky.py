@@ -1,11 +1,12 @@
 """A sky, which ``adaptive`` gives to scenes whose photographs show one.
 
 Structure from motion finds no points in a sky, and training covers it with the Gaussians of the horizon, which it makes
-large: after a hundred iterations hardly any pixel is transparent. So the question is not what shows through, but what
-would do better. The larger a Gaussian is relative to the path of the cameras, the more it looks the same from all of
-them, as a sky does. The large Gaussians are taken away, and the harmonics of a sky (:mod:`minisplat_ref.training.sky`)
-are fitted to the residual, r = photograph - rendering, by least squares over half of the photographs, and there
-over the pixels that the rest of the scene lets more than half of the light through to:
+large: after a hundred iterations hardly any pixel is transparent. So the test is not whether the background shows
+through, but whether a sky explains the photographs better. The larger a Gaussian is relative to the path of the
+cameras, the more it looks the same from all of them, as a sky does. The large Gaussians are taken away, and the
+harmonics of a sky (:mod:`minisplat_ref.training.sky`) are fitted to the residual, r = photograph - rendering, by least
+squares over half of the photographs, and there over the pixels that the rest of the scene lets more than half of the
+light through to:
 
     r = sum_k s_k b_k,   b_k = T Y_k        T: transmittance, Y_k: spherical harmonics in the direction of the pixel
 
@@ -17,8 +18,8 @@ sky.
 
 Other pixels would drown it, because of all that the scene has not learned yet. A wall that is all of one colour is no
 sky: its photographs disagree about the direction in which its edges lie. All photographs see one sky, so nearly all of
-them gain by whatever it explains, and a sky explains nearly all of what it shows; so the mean gain has to exceed 2 dB,
-and three standard errors, where a calibration with parameters for each photograph needs one.
+them gain by it, and a sky explains nearly all of its pixels; so the mean gain has to exceed 2 dB, and three standard
+errors, where a calibration with parameters for each photograph needs one.
 
 If the sky is better, it is fitted to all pixels of all photographs, and only the largest of these Gaussians are
 removed, those that are larger than the path of the cameras itself. Others show a part of the scene besides, such as the
