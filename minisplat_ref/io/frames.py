@@ -21,7 +21,7 @@ from minisplat_ref.io.json_file import as_array, as_number
 from minisplat_ref.types import FILE_FRAME, Camera, Floats, Frame, Scene
 
 EXTENT_MIN, EXTENT_MAX = 0.5, 1e4  # world units of ordinary scenes: 50 or 2.5 times the near planes, at least
-EXTENT = 4.0  # what others are scaled to, within a factor of the square root of 2
+EXTENT = 4.0  # others are scaled to these, within a factor of the square root of 2
 # Extents from the origin to the cameras, in ordinary scenes. float32 has 24 bits: at 100 extents it resolves 6e-6 of
 # an extent, a hundredth of a pixel of a photograph of 1,000.
 DISTANCE_MAX = 100.0

@@ -45,7 +45,7 @@ HALF_LEVEL = 0.5 / 255.0  # by which a float may be outside 0 to 1: it rounds to
 PIXELS_MAX = 2**29  # per image: more than cameras have, and 1.6 GB in memory
 PLAUSIBLE_PIXELS = 100_000_000  # up to this size, an image may be compressed into any number of bytes
 PIXELS_PER_BYTE = 10_000  # limit for larger ones: a white 1-bit PNG has 8256 pixels per byte
-DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
+DAMAGE_ERRORS = (  # errors of Pillow's decoders for damaged files
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
     *(RuntimeError, struct.error, zlib.error),
 )

@@ -1,8 +1,8 @@
-"""The label of a file of Gaussians: the extension that renders it, and what it lacks of its run.
+"""The label of a file of Gaussians: the extension that renders it, and the parts of its run that it lacks.
 
 The numbers of a file do not tell which renderer they were trained for: 3DGS renders traced, filtered or integrated
-Gaussians without complaint, and worse. Nor does a file hold what every view shows besides Gaussians, such as a sky. So
-a file names the extension that renders it, and what it lacks of its run:
+Gaussians without complaint, and worse. Nor does a file hold parts other than Gaussians that every view shows, such as a
+sky. So a file names the extension that renders it, and what it lacks of its run:
 
 - a PLY in comments of its header: ``comment minisplat_ref extension NAME``, ``comment minisplat_ref set NAME=VALUE``
   for a setting of its renderer, and ``comment minisplat_ref lacks PART``;

@@ -3,8 +3,8 @@
 A camera is described in the cylinder about the scene's axis, which is at right angles to the horizontal edges of the
 images and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius,
 height and viewing direction of the training cameras near that angle, so that it stays where the scene was photographed:
-beyond, nothing has taught the Gaussians what to show. Where more than a quarter of the circle was never photographed,
-the path leaves it out, and goes there and back along the rest.
+beyond, no photograph has constrained the Gaussians. Where more than a quarter of the circle was never photographed, the
+path leaves it out, and goes there and back along the rest.
 """
 
 import math
@@ -44,7 +44,7 @@ def orbit(
         Image size, pixels.
     arc : float, optional
         Angle that the path covers, radians, centred on the middle of the training cameras. Less than a full circle is
-        travelled there and back. By default, what the training cameras cover, or the full circle.
+        travelled there and back. By default the angle that the training cameras cover, or the full circle.
 
     Returns
     -------

@@ -252,7 +252,7 @@ def pass_over(file: BinaryIO, path: Path, element: Element) -> None:
 
 
 def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
-    """Read the declared vertices and ignore what follows them."""
+    """Read the declared vertices and ignore everything after them."""
     n, dtype = vertices.n, vertices.dtype
     if vertices.has_lists:
         return np.frombuffer(b"".join(_read_row(file, path, vertices) for _ in range(n)), dtype)

@@ -1,4 +1,4 @@
-"""From photographs with cameras to a :class:`Scene`: what the COLMAP and transforms.json readers have in common.
+"""From photographs with cameras to a :class:`Scene`: the common part of the readers of COLMAP and transforms.json.
 
 Pixels are read, masked, composited, undistorted and downscaled here, and everything that makes a scene unusable is
 detected here. All photographs are kept in memory as uint8 if they take a moderate part of it; if they would take more,

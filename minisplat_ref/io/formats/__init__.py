@@ -1,6 +1,6 @@
 """Compact file formats of Gaussians: a suffix, levels of precision, and a pair of functions.
 
-A PLY stores every float. A format stores less, at one of several levels, and describes how much may be lost. Those of
+A PLY stores every float. A format stores less, at one of several levels, and describes the possible loss. Those of
 other programs are here, :mod:`.catalogue`: ``.spz`` (:mod:`.spz`), Niantic's, versions 2 to 4; ``.splat``
 (:mod:`.splat`), of the first viewers in the browser; ``.sog`` (:mod:`.sog`) and ``.compressed.ply``
 (:mod:`.compressed_ply`), of SuperSplat and PlayCanvas; ``.glb`` (:mod:`.glb`), glTF with its extension for Gaussians;
@@ -47,7 +47,7 @@ class Format(NamedTuple):
     """``write_label(content, label)``: the content with a label in it; None where there is no place for one, so that it
     goes into a sidecar."""
     read_label: Callable[[bytes, str | Path], Label] | None = None
-    """``read_label(content, source)``: what ``write_label`` wrote, ``NO_LABEL`` where it did not. Raises InputError."""
+    """``read_label(content, source)``: the label of ``write_label``, ``NO_LABEL`` without one. Raises InputError."""
 
 
 def read_content(path: str | Path) -> bytes:

@@ -53,7 +53,7 @@ def without_largest(quats: Floats) -> tuple[Ints, Floats]:
 
 
 def with_largest(largest: Ints, others: Floats) -> Floats:
-    """Return unit quaternions [N, 4], wxyz, of what :func:`without_largest` returns."""
+    """Return unit quaternions [N, 4], wxyz, from the output of :func:`without_largest`."""
     others = math.sqrt(2.0) * (others - 0.5)
     quats = np.empty((len(others), 4))
     np.put_along_axis(quats, OTHERS[largest], others, axis=1)
@@ -77,7 +77,7 @@ def finish(source: str | Path, gaussians: Gaussians) -> Gaussians:
 
 
 def check_float32(gaussians: Gaussians) -> None:
-    """Refuse what no file of float32 holds.
+    """Refuse values that no file of float32 holds.
 
     Raises
     ------

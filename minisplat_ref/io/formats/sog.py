@@ -266,7 +266,7 @@ def _parse(content: bytes, source: str | Path) -> _File:
                     images[name] = _pixels(archive.read(file), name, meta, len(content))
     except InputError:
         raise
-    except Exception as error:  # what zipfile, json and Pillow raise for damaged bytes is a dozen types
+    except Exception as error:  # zipfile, json and Pillow raise a dozen types of errors for damaged bytes
         raise InputError(f"{source}: not a SOG file, or damaged ({error or type(error).__name__}); {WAY_OUT}") from None
     return _File(meta, meta["count"], images)
 
