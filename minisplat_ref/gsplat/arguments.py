@@ -122,11 +122,11 @@ REFUSED: Mapping[str, Refused] = {
 }
 """Keywords of gsplat 1.5.3 and of its main branch that are taken with their default alone."""
 NO_EFFECT = ("segmented", "channel_chunk")
-"""Keywords that change how gsplat computes, and not what; any value is taken."""
+"""Keywords that change gsplat's computation, but not its result; any value is accepted."""
 
 
 def check_refused(function: str, given: Mapping[str, Any]) -> None:
-    """Refuse what gsplat computes and we do not.
+    """Refuse options that gsplat computes and we do not.
 
     Parameters
     ----------

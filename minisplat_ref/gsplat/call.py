@@ -281,7 +281,7 @@ class Meta(Mapping[str, Any]):
         make = self._make_tile_lists
         if key in TILE_LISTS and make is not None:
             self._values.update(make())
-            self._make_tile_lists = None  # frees what they were made of
+            self._make_tile_lists = None  # frees the arrays that they were made of
         return self._values[key]
 
     def __contains__(self, key: object) -> bool:
