@@ -5,7 +5,7 @@
 :mod:`.runs`              the trainings, one after the other; those that were cut off continue
 :mod:`.metrics`           metrics of finished runs; means over seeds
 :mod:`.speed`             rendering the test views, all models interleaved
-:mod:`.crops`             the parts of test views that differ most
+:mod:`.crops`             crops of test views for inspection
 :mod:`.results`           all of these together, and compare.json
 :mod:`.table`             mean, deviation and ratio to the first recipe, as text
 :mod:`.figures`           PSNR over time, iterations and number of Gaussians; the gallery

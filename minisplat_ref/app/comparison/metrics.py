@@ -84,8 +84,8 @@ class RecipeMetrics(NamedTuple):
     def error_of_difference(self, metric: Metric, first: "RecipeMetrics") -> float | None:
         """Return the standard error of the mean difference to the first recipe, paired by seed.
 
-        Recipes that are trained with one seed see the same views in the same order; what such a seed does to both is no
-        part of the difference. None of a single seed, or where a value lacks.
+        Recipes that are trained with one seed see the same views in the same order; the effect of such a seed on both
+        is no part of the difference. None of a single seed, or where a value lacks.
         """
         pairs = zip((run[metric.key] for run in self.runs), (run[metric.key] for run in first.runs), strict=True)
         differences = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]

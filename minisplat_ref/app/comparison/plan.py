@@ -14,7 +14,7 @@ from minisplat_ref.metrics.lpips import check_views, load_network
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
 
-PLAN = "plan.json"  # what `--resume` continues from
+PLAN = "plan.json"  # the state that `--resume` continues
 PATHS = ("scene", "lpips_weights", "init")  # of a plan
 POINTS_PER_RUN = 24  # of each curve: enough to see when a quality is reached, and where it falls again
 
@@ -122,7 +122,7 @@ def check_free(folder: Path) -> None:
 
 
 def check(plan: Plan) -> Scene:
-    """Refuse what could not be carried out, before anything is written; return the scene.
+    """Refuse a plan that cannot be carried out, before anything is written; return the scene.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def remove_if_unused(folder: Path) -> None:
 
 
 def load_plan(folder: Path) -> Plan:
-    """Read what :func:`save_plan` wrote.
+    """Read a file of :func:`save_plan`.
 
     Raises
     ------

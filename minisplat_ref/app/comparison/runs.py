@@ -61,7 +61,7 @@ def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
     Raises
     ------
     KeyboardInterrupt
-        After Ctrl-C or SIGTERM, when the running training has saved what there is.
+        After Ctrl-C or SIGTERM, when the running training has saved its state.
     CalledProcessError
         A training has been killed or has a programming error.
     """
