@@ -1,4 +1,4 @@
-"""The plan seen from above: what the coarse model holds, the cores, and the cameras in the colours of their blocks."""
+"""The plan seen from above: the coarse model, the cores, and the cameras in the colours of their blocks."""
 
 import math
 from pathlib import Path

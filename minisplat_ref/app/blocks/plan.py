@@ -1,4 +1,4 @@
-"""The plan of a training in blocks: what was asked for, the blocks, and their trainings; and how the folder holds it.
+"""The plan of a training in blocks: the settings, the blocks, and their trainings; and its files in the folder.
 
 ::
 
@@ -34,7 +34,7 @@ from minisplat_ref.types import Floats, Scene
 
 PLAN = "plan.json"
 COARSE = "coarse"
-COARSE_RECIPE = "3dgs-accel"  # its Gaussians are what every recipe can start from
+COARSE_RECIPE = "3dgs-accel"  # every recipe can start from its Gaussians
 COARSE_PART = 4  # a quarter of the iterations of a training of the whole
 COARSE_ITERATIONS = 1000  # for recipes that decide their own length
 PIXEL_BYTES = 4  # of a photograph, three, and of its mask
@@ -114,7 +114,7 @@ def begin(asked: Asked, config: dict[str, Any]) -> None:
 
 
 def load_asked(folder: Path) -> Asked:
-    """Read what :func:`begin` wrote.
+    """Read the file of :func:`begin`.
 
     Raises
     ------
