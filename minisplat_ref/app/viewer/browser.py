@@ -1,7 +1,7 @@
 """The window of a viewer: a server on this machine, by viser, that browsers connect to.
 
-viser's threads receive what browsers send. They only leave it where :meth:`Viewer.draw_next` finds it, which does the
-work in the thread that calls it. Messages of a browser decide what is rendered, never which file is written: a page
+viser's threads receive the messages of browsers. They only leave it where :meth:`Viewer.draw_next` finds it, which does
+the work in the thread that calls it. Messages of a browser decide what is rendered, never which file is written: a page
 from another site can use this port, too.
 """
 

@@ -71,7 +71,7 @@ def _alpha(drawn: Drawn) -> Picture:
 
 
 def _transmittance(drawn: Drawn) -> Picture:
-    """Show 1 - alpha in powers of ten: what lies behind is seen by this factor."""
+    """Show 1 - alpha in powers of ten: the factor by which the background is visible."""
     left = np.maximum(1 - drawn.output.alpha, 1e-4)  # [H, W]; where the compositor stops
     return Picture(
         colorize(np.log10(left), -4.0, 0.0, "magma"), "light that passes: dark 0.0001, bright 1 (logarithmic)"
@@ -85,7 +85,7 @@ def _normal(drawn: Drawn) -> Picture:
 
 
 def _importance(drawn: Drawn) -> Picture:
-    """Show how much the Gaussian that dominates a pixel weighs in the whole view, ``sum w`` over its pixels."""
+    """Show the weight in the whole view of the Gaussian that dominates a pixel, ``sum w`` over its pixels."""
     ids = drawn.stats.dominant_ids
     weights = np.append(drawn.stats.blend_weight_sum, 0)[ids]  # [H, W]; id -1 gets 0
     highest = float(weights.max(initial=0.0))
