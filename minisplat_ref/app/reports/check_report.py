@@ -1,4 +1,4 @@
-"""The page of a check: what the oracle or a measurement reports, as ``report.html``."""
+"""The page of a check: the report of the oracle or of a measurement, as ``report.html``."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

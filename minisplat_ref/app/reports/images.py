@@ -1,4 +1,4 @@
-"""Images for a person to look at: renders beside photographs, errors and depths in colour."""
+"""Images for inspection: renders beside photographs, errors and depths in colour."""
 
 import numpy as np
 from numpy.typing import NDArray

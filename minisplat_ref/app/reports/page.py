@@ -1,4 +1,4 @@
-"""The one look of all reports: an HTML file with images, curves and tables, and nothing that it loads from elsewhere.
+"""The common layout of all reports: a self-contained HTML file with images, curves and tables.
 
 Images are in the page in base64, curves are inline SVG (:mod:`minisplat_ref.app.reports.plots`), and so are the style
 sheet and the few lines of script (:mod:`minisplat_ref.app.reports.page_style`), which are optional: without them a
