@@ -1,4 +1,4 @@
-"""The checkpoints of a run: when they are written, which one counts, and the model that is in it.
+"""The checkpoints of a run: their schedule, the choice of the newest whole one, and the model in it.
 
 The last two are kept. One that is damaged, by a faulty disk or a person, is skipped with a line about it.
 """
@@ -31,7 +31,7 @@ def save(folder: Path, state: TrainState, recipe: Recipe) -> None:
 
 
 def save_regularly(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
-    """Return a callback of the loop that saves every SECONDS, and before what may find no room in memory."""
+    """Return a callback of the loop that saves every SECONDS, and before an iteration that may run out of memory."""
     last_saved = time.monotonic()
 
     def on_step(report: StepReport) -> None:

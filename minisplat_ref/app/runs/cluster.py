@@ -158,7 +158,7 @@ def _client(workers: Workers) -> Iterator[Any]:
                     n_workers=workers.n,
                     threads_per_worker=1,
                     dashboard_address=None,
-                    memory_limit=0,  # the commands are other processes, which foresee what memory they take
+                    memory_limit=0,  # the commands are other processes, which check their memory beforehand
                     silence_logs="CRITICAL",
                 )
             stack.enter_context(cluster)

@@ -1,6 +1,6 @@
 """The decisions of a training without a schedule, for a page: a paragraph, figures with the evidence, and a table.
 
-Of the recipe ``adaptive`` (:mod:`minisplat_ref.training.pace`): at which iteration it did what, and why.
+The recipe is ``adaptive`` (:mod:`minisplat_ref.training.pace`); each decision has its iteration and its reason.
 """
 
 import math

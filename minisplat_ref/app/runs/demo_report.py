@@ -1,4 +1,4 @@
-"""The demo's ``report.html``: images of held-out views, depth beside the true depth, curves, and what to try next."""
+"""The demo's ``report.html``: images of held-out views, depth beside the true depth, curves, and the next steps."""
 
 import os
 import platform

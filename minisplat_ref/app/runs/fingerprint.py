@@ -79,7 +79,7 @@ def read(folder: Path) -> Entries | None:
 
 
 def difference(entries: Entries, others: Entries) -> str:
-    """Say what differs between the views of a run and those of a scene; nothing where they are the same.
+    """Describe the differences between the views of a run and those of a scene; nothing where they are the same.
 
     Whether a view is one for training or for testing does not matter here; see :func:`is_split_alike`.
 
@@ -144,7 +144,7 @@ def trained_on(entries: Entries) -> set[str]:
 
 
 def warn_of_unchecked(folder: Path, entries: Entries | None) -> None:
-    """Warn of what cannot be compared of a run that an older version made."""
+    """Warn about parts of a run of an older version that cannot be compared."""
     if entries is None:
         message = f"{folder} has no {CAMERAS}: whether the scene is its own cannot be checked"
     elif not all(PHOTOGRAPH in entry for entry in entries):
@@ -169,7 +169,7 @@ def check(folder: Path, scene: Scene, source: str) -> None:
     Raises
     ------
     InputError
-        Says what differs.
+        Names the difference.
     """
     entries = read(folder)
     if entries is not None:

@@ -19,7 +19,7 @@ class Fired(NamedTuple):
     published: dict[str, int]
     """Number of times that each mechanism acts in the recipe as published."""
     runs: Sequence[Sequence[Mechanism]]
-    """Per seed, what its mechanisms have done."""
+    """Per seed, the actions of its mechanisms."""
 
     @property
     def never(self) -> list[str]:

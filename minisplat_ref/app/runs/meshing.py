@@ -48,7 +48,7 @@ class Asked(NamedTuple):
 
 
 class Meshed(NamedTuple):
-    """The surface, in the frame of the run's files, and how it was found."""
+    """The surface, in the frame of the run's files, and the settings of its extraction."""
 
     mesh: ColoredMesh
     voxel: float
@@ -145,7 +145,7 @@ def _find_surface(opened: Opened, kind: DepthKind) -> _Places:
 def _choose_grid(opened: Opened, places: _Places, asked: Asked) -> Grid:
     """Return the grid: voxels as large as the pixels of the surface, or as many as ``N_VOXELS_MAX``.
 
-    Without bounds, what lies nearer to the point on which the cameras look than the nearest camera is not contracted.
+    Without bounds, the space nearer to the point that the cameras face than the nearest camera is not contracted.
     """
     footprint = float(np.median(places.footprints))
     given = None if asked.voxel is None else asked.voxel / opened.frame.unit

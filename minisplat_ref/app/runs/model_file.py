@@ -1,4 +1,4 @@
-"""A model's file: who draws it, as its label says, and what it lacks of its run."""
+"""A model's file: the extension that renders it, from its label, and the parts of its run that it lacks."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -36,7 +36,7 @@ def missing_parts(shared: Iterable[str]) -> tuple[str, ...]:
 
 
 def describe_parts(names: Iterable[str]) -> str:
-    """Return parts of a model in a few words; those that only another version knows by their names."""
+    """Return parts of a model in a few words; parts that only another version has, by their names."""
     return " and ".join(PARTS.get(name, name) for name in names)
 
 
@@ -148,7 +148,7 @@ def read_population(path: Path, owner: Extension) -> Any:
 
 
 def read_model(path: Path, extension: str | None = None) -> ModelFile:
-    """Read a PLY or a compact file on its own; warn of what it lacks, and of what is left out.
+    """Read a PLY or a compact file on its own; warn about parts that it lacks, and about parts that are left out.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def read_model(path: Path, extension: str | None = None) -> ModelFile:
     Raises
     ------
     InputError
-        The file is damaged or missing, its extension is not installed, or it does not hold what that needs.
+        The file is damaged or missing, its extension is not installed, or an array is missing that the extension needs.
     """
     label = label_of(path)
     given = None

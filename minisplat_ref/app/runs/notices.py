@@ -1,4 +1,4 @@
-"""Warnings about what does not stop a run: a scene without points, photographs of a few pixels, no Gaussians.
+"""Warnings that do not stop a run: a scene without points, photographs of a few pixels, no Gaussians.
 
 Each is one line, which the command line prints before it continues.
 """

@@ -106,7 +106,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
 
 
 def check_views(scene: Scene, what: str) -> None:
-    """Refuse a scene with too few training views to hold some out; ``what`` is what needs them."""
+    """Refuse a scene with too few training views to hold some out; ``what`` names the purpose."""
     n_views = len(scene.train_views)
     if n_views < VIEWS_MIN:
         raise InputError(

@@ -44,7 +44,7 @@ class Plane(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A rectangle of the plane, half-open: what touches the upper edge is outside."""
+    """A rectangle of the plane, half-open: points on the upper edge are outside."""
 
     low: tuple[float, float]
     """Minus infinity where it has no end."""
@@ -126,7 +126,7 @@ class Part(NamedTuple):
 
 
 def read_part(path: Path, source: Path) -> Part:
-    """Read what :meth:`Part.write` wrote.
+    """Read the files of :meth:`Part.write`.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def _of_another_version(path: Path, error: Exception) -> InputError:
 
 
 def box_from_json(content: Any) -> Box:
-    """Read what :meth:`Box.to_json` wrote; raises TypeError or ValueError for anything else."""
+    """Read the output of :meth:`Box.to_json`; raises TypeError or ValueError for anything else."""
     (x0, y0), (x1, y1) = content
     low = tuple(-math.inf if value is None else float(value) for value in (x0, y0))
     high = tuple(math.inf if value is None else float(value) for value in (x1, y1))

@@ -133,7 +133,7 @@ class Progress(AbstractContextManager["Progress"]):
         self._bar.initial = self._bar.last_print_n = self._bar.n + 1
 
     def _min_rest(self, report: StepReport) -> str:
-        """Say how long a training that has not decided its length continues at least: as if it began to cool now."""
+        """Estimate the shortest rest of a training that has not decided its length: as if it began to cool now."""
         if self._cooling is None or report.last_step is not None:
             return ""
         bar = self._bar.format_dict

@@ -1,4 +1,4 @@
-"""Parts that the reports of runs share: held-out views with their errors, curves over the training, and what fired."""
+"""Parts that the reports of runs share: held-out views with their errors, curves over the training, and mechanisms."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -22,7 +22,7 @@ N_VIEWS, N_SAMPLED = 4, 5000
 def foresee(scene: Scene, state: TrainState, conventions: Conventions, backend: Backend) -> memory.Needs:
     """Return the memory that a training takes as it begins, besides that of the program and the photographs.
 
-    Photographs that do not all fit give up, or get, what room is left.
+    Photographs that do not all fit give up, or get, the room that is left.
 
     Parameters
     ----------

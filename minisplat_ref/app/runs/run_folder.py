@@ -1,4 +1,4 @@
-"""The folder that ``train`` leaves: which file is called what, and how each is read and written."""
+"""The folder that ``train`` leaves: the names of its files, and their readers and writers."""
 
 import json
 import os
@@ -20,7 +20,7 @@ METRICS = run_files.METRICS
 LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, on request
 EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
-CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
+CHECKPOINT = "checkpoint.npz"  # the state that `--resume` continues
 PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
 DECISIONS = "decisions.json"  # measurements and decisions of a recipe that decides its own length
 REPORT = "report.html"  # a report of all of it
@@ -62,7 +62,7 @@ def has_begun(folder: Path) -> bool:
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing into a run, and clear away what killed ones were writing.
+    """Keep other processes from writing into a run, and remove unfinished files of killed ones.
 
     The lock is the system's, on the folder itself, and ends with the process. Windows and some network disks have none.
 

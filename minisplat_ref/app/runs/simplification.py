@@ -142,7 +142,7 @@ def limit_of(target: Target, size: PlySize) -> int | None:
 
 
 def fine_tuning(recipe: Recipe, iterations: int) -> tuple[Recipe, Pace]:
-    """Return the recipe of this many iterations after the schedule's end without events, and how far it has cooled."""
+    """Return the recipe of this many iterations after the schedule's end without events, and its stage of cooling."""
     end = recipe.iterations + iterations
     rates, pace = recipe.learning_rates, Pace(cooling_from=recipe.iterations, last_step=end)
     if recipe.cooling is None:

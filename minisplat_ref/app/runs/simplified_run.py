@@ -1,4 +1,4 @@
-"""The folder that ``simplify`` leaves: a run like others, without a checkpoint, and what it was chosen by.
+"""The folder that ``simplify`` leaves: a run like others, without a checkpoint, and the evidence for its size.
 
 ``config.json`` is that of the run with one entry more, so ``render``, ``eval``, ``info`` and ``convert`` take the
 folder like that of a training. Nothing in it depends on the time: the same run gives the same bytes.
@@ -147,7 +147,7 @@ def of_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | Non
 
 
 def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation) -> None:
-    """Write what makes the folder a run: its configuration, cameras and measures."""
+    """Write the files that make the folder a run: its configuration, cameras and metrics."""
     config = run_folder.read_json_object(run.folder / run_folder.CONFIG)
     about = {name: result[name] for name in ("run", "target", "fine_tune")}
     config |= {"settings": run.settings._asdict(), "simplified": about}

@@ -24,13 +24,13 @@ from minisplat_ref.types import Gaussians, Model, Scene
 
 
 class Start(NamedTuple):
-    """The state before the first iteration of a training that is given what to start from."""
+    """The state before the first iteration of a training with a given start."""
 
     state: TrainState
     source: str | None
     """The source of the start, in one line; None for the scene's own points."""
     notices: list[str]
-    """Sentences on what the source lacks."""
+    """Sentences about missing parts of the source."""
 
 
 def start_from(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int) -> Start:
@@ -167,7 +167,7 @@ def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
     start : Scene
         For :func:`minisplat_ref.training.loop.initial_state`.
     notices : list of str
-        Sentences on what the file lacks.
+        Sentences about missing parts of the file.
 
     Raises
     ------

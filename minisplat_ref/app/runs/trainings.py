@@ -1,4 +1,4 @@
-"""Trainings that are processes of their own, with folders from which they continue: how far one is, and what is next.
+"""Trainings as separate processes, with folders from which they continue: the status of each, and its next command.
 
 A separate process has a separate peak memory, and when it is killed, nothing else ends.
 """
@@ -103,7 +103,7 @@ def train_here(words: Sequence[str]) -> int:
     Raises
     ------
     KeyboardInterrupt
-        After Ctrl-C or SIGTERM, when it has saved what there is.
+        After Ctrl-C or SIGTERM, when it has saved its state.
     CalledProcessError
         It has been killed or has a programming error.
     """

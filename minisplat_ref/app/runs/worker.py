@@ -29,7 +29,7 @@ ATTACHED = (sys.executable, "-m", "minisplat_ref.app.runs.attached")
 COMPILE = "from minisplat_ref.app.runs.first_use import compile_kernels; compile_kernels('cpu')"
 POLL_SECONDS = 0.5  # between looks at the token
 RELEASE_SECONDS = 30.0  # in which the process of a killed worker has let go of the folder
-SAID_BYTES = 8000  # of the end of what a command printed, to show if it fails
+SAID_BYTES = 8000  # of the end of a command's output, to show if it fails
 INTERRUPTED = 130
 
 
@@ -89,7 +89,7 @@ def unseen(site: Site) -> str | None:
 
 
 def compile_once() -> None:
-    """Compile this machine's kernels if none are on disk; what goes wrong is told by the command that needs them."""
+    """Compile this machine's kernels if none are on disk; errors are reported by the command that needs them."""
     subprocess.run([sys.executable, "-c", COMPILE], stdin=subprocess.DEVNULL, capture_output=True, check=False)
 
 
