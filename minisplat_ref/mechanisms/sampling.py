@@ -12,7 +12,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.types import Camera, Floats, Scene
 
 MARGIN = 0.15  # fraction of the image's size by which a centre may lie outside and still count as seen
-NEAR = 0.2  # world units: a camera does not see what is nearer than that
+NEAR = 0.2  # world units: a camera does not see points nearer than this
 
 
 def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:

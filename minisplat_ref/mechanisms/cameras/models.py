@@ -29,7 +29,7 @@ class CameraModel(NamedTuple):
     rays: Callable[[Floats, Camera], tuple[Floats, Floats]]
     """``rays(pixels, camera)``: origins [P, 3] and unit directions [P, 3] through pixels [P, 2]; NaN where none is."""
     depths: Callable[[Floats], Floats]
-    """``depths(x)``: [N] what orders points and is bounded by the near and far planes, world units."""
+    """``depths(x)``: [N] the depth that orders points and is bounded by the near and far planes, world units."""
     depths_vjp: Callable[[Floats, Floats], Floats]
     """``depths_vjp(x, v)``: the gradient [N, 3]."""
 

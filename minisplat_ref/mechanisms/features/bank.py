@@ -25,7 +25,7 @@ def check_size(bank: FeatureBank, width: int, height: int, what: str) -> None:
     Raises
     ------
     InputError
-        Says which image, and how large it has to be.
+        Names the image, and the size that it has to have.
     """
     if min(width, height) < bank.min_side:
         raise InputError(

@@ -50,7 +50,7 @@ GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
 
 
 class MaterialGradient(NamedTuple):
-    """Gradient of the loss with respect to what materials are made of."""
+    """Gradient of the loss with respect to the parameters of materials."""
 
     fields: Mapping[str, Floats]
     """By the fields of the population that only materials are made of."""
@@ -210,7 +210,7 @@ def render(
 
 
 def render_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`, by the chain rule; how much of the environment is visible is held constant.
+    """Gradient of :func:`render`, by the chain rule; the visibility of the environment is constant.
 
     Per pixel::
 

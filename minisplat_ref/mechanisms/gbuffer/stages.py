@@ -55,7 +55,7 @@ def shading_stage(
     render: Callable[..., tuple[RenderOutput, Any]],
     shaded: Callable[[Any], ReflectiveTape],
 ) -> Stage:
-    """Return a renderer at a stage of shading; what reflected rays see is held at random values.
+    """Return a renderer at a stage of shading; the light along reflected rays has fixed random values.
 
     Parameters
     ----------

@@ -6,8 +6,8 @@ The ray ``O + t d`` meets the disc of the centre mu, the axes r_0 and r_1, the n
     alpha = min(alpha_max, o exp(-(u^2 + v^2) / 2))
 
 and the transmittance is the product of all 1 - alpha, in any order. Hits of alpha below ``alpha_min`` do not count, and
-no more are sought where less than ``transmittance_min`` is left. There is no low-pass: a disc is hit where it is. No
-gradient is given; what is hidden changes in steps.
+no more are sought where less than ``transmittance_min`` is left. There is no low-pass: a disc is hit where it is. There
+is no gradient; visibility changes in steps.
 """
 
 import numpy as np

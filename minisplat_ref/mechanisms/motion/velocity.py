@@ -9,7 +9,7 @@ inverse of the other, then
     (iii)  v = -J_w^-1 dw/dt at x          the same as (i), from the backward warp: w(x(t), t) is constant
 
 and ``v = J u``. (ii) is the step of Lucas and Kanade, 1981, and the form after which Gaussian Splatting Lucas-Kanade is
-named: the displacement before a warp that does what a step of time does. It is not a velocity in the world.
+named: the displacement before a warp that has the effect of a step of time. It is not a velocity in the world.
 """
 
 from collections.abc import Callable
@@ -134,7 +134,7 @@ def integrate(velocity: Callable[[Floats, float], Floats], start: Floats, time: 
     start : ndarray of shape (N, 3)
         x at ``time``.
     time, step : float
-        t, and how long to integrate.
+        t, and the length of the integration.
     n : int
         Number of steps of length ``h = step / n``.
     """

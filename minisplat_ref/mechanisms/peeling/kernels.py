@@ -112,7 +112,7 @@ class Tape(NamedTuple):
     fragments: Fragments
     layers: Layers
     shades: Floats  # [F, 4] colour and alpha of each
-    transmittances: Floats  # [F] in front of each; 0 for what was not blended
+    transmittances: Floats  # [F] in front of each; 0 for fragments that were not blended
     n_blended: Ints  # [H W] int64
     T_end: Floats  # [H W]
 

@@ -2,13 +2,13 @@
 
 A mesh has a colour and an opacity at each vertex, (r, g, b, a), which are linear on its triangles: with the barycentric
 coordinates b of the point where a pixel's ray meets a triangle, ``(c, alpha) = sum_i b_i (c_i, a_i)``. Both sides of a
-triangle are rendered. A pixel blends what its ray meets, nearest first::
+triangle are rendered. A pixel blends the triangles that its ray hits, nearest first::
 
     image = sum_l c_l alpha_l T_l + T_end background,   T_l = prod_{j before l} (1 - alpha_j),   alpha = 1 - T_end
 
 That is 3DGS's compositing, but without its thresholds: no alpha is clamped or skipped, and an opaque mesh is rendered
 as by a z-buffer. Depth peeling (Everitt 2001) finds the layers of all pixels one after the other; a graphics program
-peels a fixed number of them, and leaves out what lies behind.
+peels a fixed number of them, and leaves out the layers behind.
 
 - A pixel belongs to a triangle if its centre lies inside. On an edge, exactly, it belongs to the one of two neighbours
   that also contains the point a little to the right, or else below: neither to both nor to none.
@@ -49,7 +49,7 @@ class Frame(NamedTuple):
     near: float
     """Camera z of the near plane, world units."""
     max_layers: int = ALL_LAYERS
-    """Of a pixel, at least 1; what lies behind them is left out."""
+    """Of a pixel, at least 1; layers behind them are left out."""
 
 
 class Peeled(NamedTuple):
@@ -68,7 +68,7 @@ class Peeled(NamedTuple):
 
 
 class PeelGradient(NamedTuple):
-    """Gradient of the loss with respect to what an image of a mesh depends on."""
+    """Gradient of the loss with respect to the inputs of a mesh's image."""
 
     vertices: Floats
     """[P, 3] world frame."""
@@ -93,7 +93,7 @@ def gradient_of(
 
 
 def check_translucent(mesh: TranslucentMesh, source: object) -> None:
-    """Refuse a mesh whose numbers do not make an image; ``source`` is what messages begin with.
+    """Refuse a mesh whose numbers do not make an image; ``source`` is the beginning of messages.
 
     Raises
     ------

@@ -4,6 +4,6 @@
 NumPy; :mod:`.kernels` states the hit once more, for the plain kernels. The quantities that depend on the order of the
 hits, the median depth and gsplat's distortion, are in :mod:`.ray_measures` and, for kernels, in :mod:`.ray_kernels`.
 :mod:`.renderer` chooses between the two, and is the pair that training calls. Normals and depths are channels of the
-image like colours, so their gradients need no further code. :mod:`.discs` and :mod:`.disagreement` are what recipes of
-surfels share: start, density control, and the loss on normals.
+image like colours, so their gradients need no further code. :mod:`.discs` and :mod:`.disagreement` are shared by
+recipes of surfels: start, density control, and the loss on normals.
 """

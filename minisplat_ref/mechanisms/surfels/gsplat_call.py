@@ -62,7 +62,7 @@ class Asked(NamedTuple):
 
 
 class OneView(NamedTuple):
-    """A view, and what its gradient needs."""
+    """A view, and the values that its gradient needs."""
 
     shown: Shown
     primitives: Primitives

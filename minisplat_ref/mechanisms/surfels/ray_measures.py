@@ -23,7 +23,7 @@ from minisplat_ref.types import Floats, Ints, TileBins
 
 
 class RayMeasures(NamedTuple):
-    """Images of what lies along each ray."""
+    """Images of the measures along each ray."""
 
     median: Floats
     """[H, W] world units."""

@@ -100,7 +100,7 @@ def hit_vjp(
     found : Hit
         Its result.
     v_mean, v_shape : ndarray of shape (G, P)
-        ``v_alpha``, as for every response; what moves a surfel also shapes it here, so ``v_mean`` serves both.
+        ``v_alpha``, as for every response; the same parameters move and shape a surfel, so ``v_mean`` serves both.
     v_depths : ndarray of shape (G, P), optional
         v_z, of the depths of the hits.
 

@@ -38,7 +38,7 @@ from minisplat_ref.types import (
 
 BUFFER_MAX = 1024  # hits; for more, use None
 OF_STATS = frozenset({"stats", "surface", "dominant_depth"})
-"""What needs blend statistics."""
+"""The outputs that need blend statistics."""
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
 """The response of the reference, in the order of the list unless ``buffer_size`` is set."""
