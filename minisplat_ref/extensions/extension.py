@@ -45,7 +45,7 @@ class Extension(NamedTuple):
     saves_plain: bool = False
     """Whether ``save`` writes Gaussians of 3DGS, and ``load`` reads the six fields: then its files have no label."""
     stages: Callable[..., Any] | None = None
-    """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks, besides others."""
+    """``stages(backend, setting, rng)``: further stages that ``oracle gradients --extension NAME`` checks."""
     sample: Callable[[Gaussians, np.random.Generator], Any] | None = None
     """Makes of any Gaussians a population that exercises the renderer, for ``bench --extension NAME``; by default the
     representation's ``extend``, which may leave them as they are."""

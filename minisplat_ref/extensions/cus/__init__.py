@@ -33,11 +33,11 @@ it maps are classical: colours and the energies of Gabor filters at three scales
 the anchors, which other viewers show as one Gaussian each.
 
 This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical,
-without any claim about meaning. Networks add to what an anchor begins with, which is the colour of its points; their
-last layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points, instead of
-0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have different units
-and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights, gamma and rates
-are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
+without any claim about meaning. Networks add to the initial values of an anchor, such as the colour of its points;
+their last layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points,
+instead of 0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have
+different units and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights,
+gamma and rates are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
 
 Left out: the language model, and the pruning of anchors by opacity, which in Scaffold-GS accompanies their growing.
 """

@@ -1,4 +1,4 @@
-"""The memory of features, and how a pixel reads it: few remembered features in place of many stored ones.
+"""The memory of features, and its readout by a pixel: few features in the memory instead of many stored ones.
 
 The memory M [K, D] keeps a feature r of the photographs, one after the other, if it is like none that is kept::
 

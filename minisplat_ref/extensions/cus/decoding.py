@@ -29,7 +29,7 @@ Shared = Mapping[str, Floats]
 
 
 class Decoded(NamedTuple):
-    """The Gaussians of a view, and what their gradient needs."""
+    """The Gaussians of a view, and the values that their gradient needs."""
 
     gaussians: Gaussians
     """N K rows, those of an anchor one after another."""

@@ -44,7 +44,7 @@ N_REMEMBERED, N_CHANNELS = 3, 5
 SPREAD = 0.5  # of random weights
 VOXEL, N_ANCHORS = 8.0, 8  # side in units of the median scale, and the most that are taken
 WIDER = 3.0  # than anchors begin with
-ON = 0.5  # is added to what ReLUs read
+ON = 0.5  # is added to the inputs of ReLUs
 LONG, SHORT = 10.0, 0.02  # memory and keys of the loss: large features, and attention to more than one row
 NEAR = 1.0  # standard deviation of features from those that are wanted
 MODELS = 3  # seed of the models: with it no gradient is small relative to the values of which differences are taken
@@ -135,7 +135,7 @@ def _sides(model: Model, view: View, *, with_queries: bool = False) -> tuple[Any
 
 
 class _Movable(NamedTuple):
-    """A small model, and what of it is differentiated."""
+    """A small model, and the parts of it that are differentiated."""
 
     model: Model
     view: View

@@ -1,8 +1,8 @@
 """Discretised SDF: opacity from a signed distance that each surfel stores.
 
 This follows Discretized SDF Gaussian Splatting (2025), arXiv 2507.15629, on the surfels, materials and shading of
-Ref-Gaussian (:mod:`minisplat_ref.mechanisms.gbuffer`). A surfel with the centre mu and the normal n stores s, how far
-mu is from the surface. With one gamma > 0 for all, which is trained, too, its opacity is
+Ref-Gaussian (:mod:`minisplat_ref.mechanisms.gbuffer`). A surfel with the centre mu and the normal n stores s, the
+signed distance of mu from the surface. With one gamma > 0 for all, which is trained, too, its opacity is
 
     o = 4 exp(-gamma s) / (1 + exp(-gamma s))^2 = sech^2(gamma s / 2),   do/ds = -gamma tanh(gamma s / 2) o
 

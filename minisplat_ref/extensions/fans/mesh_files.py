@@ -75,7 +75,7 @@ def is_fans(path: str | Path) -> bool:
 
 
 def load_fans(path: str | Path, population: Any = Fans) -> Fans:
-    """Read what :func:`save_fans` wrote, in float32.
+    """Read a file of :func:`save_fans`, in float32.
 
     Raises
     ------

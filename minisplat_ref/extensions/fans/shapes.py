@@ -82,7 +82,7 @@ def check_shape(shape: FanShape) -> None:
 def convert_gaussians(gaussians: Gaussians, shape: FanShape) -> Fans:
     """Return the fans of Gaussians, in their dtype.
 
-    Colours are those of degree 0, ``0.5 + C_0 c_0``, clipped to [0, 1], which is what mesh files hold.
+    Colours are those of degree 0, ``0.5 + C_0 c_0``, clipped to [0, 1], as in mesh files.
 
     Parameters
     ----------

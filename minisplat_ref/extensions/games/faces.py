@@ -25,7 +25,7 @@ class FaceGaussians(NamedTuple):
     """Gaussians with the face that each is on: the six fields of ``Gaussians``, and five more."""
 
     means: Floats
-    """[N, 3] no parameter: what follows from the further fields, for culling and for files; so are the next two."""
+    """[N, 3] no parameter: computed from the further fields, for culling and for files; so are the next two."""
     quats: Floats
     log_scales: Floats
     opacity_logits: Floats
@@ -84,7 +84,7 @@ def place_vjp(g: FaceGaussians, v: FaceGaussians) -> FaceGaussians:
     g : FaceGaussians
         As for :func:`place`.
     v : FaceGaussians
-        Derivatives with respect to what it returns; those of the five further fields are zero.
+        Derivatives with respect to its result; those of the five further fields are zero.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref gaustudio masks``: masks of the sky as files, to look at and to mend."""
+"""The command ``minisplat-ref gaustudio masks``: masks of the sky as files, for inspection and correction."""
 
 import argparse
 from pathlib import Path

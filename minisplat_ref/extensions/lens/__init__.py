@@ -15,7 +15,7 @@ Scenes of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, S
 are read as photographed. Where a lens has no distortion, images are those of the exact rays of a pinhole.
 
 This deviates from 3DGUT as follows: a Gaussian of which a sigma point is not seen gets the whole image as its bounds,
-and a ray meets only what lies in front of it. Left out are rolling shutter, thin prisms, secondary rays, the exact
+and a ray meets only Gaussians in front of it. Left out are rolling shutter, thin prisms, secondary rays, the exact
 order of each pixel, derivatives with respect to the lens, and recipes that search surfaces (``adaptive``, the
 ``mini-splatting`` family), which refuse such cameras. There is no low-pass, so a Gaussian much thinner than a
 pixel may be missed by all rays.

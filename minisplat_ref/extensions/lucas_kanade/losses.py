@@ -103,7 +103,7 @@ def flow(rendered: Rendered, *, flows: str) -> tuple[float, Cotangents]:
 def rendered_flow(model: Model, view: View, other: View, request: Request) -> tuple[Floats, Floats, FlowTape]:
     """Return the flow ``F = sum_i w_i f_i`` from a view to another, and the accumulated opacity.
 
-    ``f_i`` is how far a Gaussian moves in the image, from its place in the view to where one step of Runge-Kutta leads
+    ``f_i`` is the motion of a Gaussian in the image, from its place in the view to where one step of Runge-Kutta leads
     it in the other (:func:`~minisplat_ref.mechanisms.motion.velocity.power_steps`); 0 where the other camera does not
     see it in front of itself.
 
@@ -134,7 +134,7 @@ def rendered_flow(model: Model, view: View, other: View, request: Request) -> tu
 def blended_steps(
     g: Gaussians, after: Floats, cameras: tuple[Camera, Camera], request: Request
 ) -> tuple[SplatTape, Step, Ints]:
-    """Blend how far Gaussians move in the image.
+    """Blend the motion of Gaussians in the image.
 
     Parameters
     ----------

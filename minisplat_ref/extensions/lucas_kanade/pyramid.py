@@ -5,7 +5,7 @@ the gradient g of the images, their difference e and the sums over window and co
 
     (sum g g^T + eps I) d = -sum g e
 
-A step is right only while the motion is smaller than what blurs the image, so the flow of a coarse level is the start
+A step is right only while the motion is smaller than the blur of the image, so the flow of a coarse level is the start
 of the next finer one (Bouguet 2000), where its median over 3 x 3 pixels moves the second image. There is no smoothness
 term: where a window has no texture in two directions, or the flow there and back does not return, nothing is known.
 Forward only; a loss takes the flow as it is.

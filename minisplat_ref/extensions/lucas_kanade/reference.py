@@ -1,4 +1,4 @@
-"""The formulas: how a Gaussian turns, how far it moves in the image, and both losses; each beside its gradient."""
+"""The formulas of a Gaussian's rotation, its motion in the image, and both losses; each beside its gradient."""
 
 from typing import NamedTuple
 

@@ -12,8 +12,8 @@ its points in the world and h the prediction's slope::
 
 kappa is the variance of a uniform segment or triangle, and p the projected mean. On a plane 1/z is linear in the image,
 so a flat primitive that is large against a pixel has the depth of its own plane exactly. Seen from its edge, or smaller
-than the low-pass eps, its plane turns towards the camera instead of running to infinity: what 2D Gaussian Splatting
-does by taking the depth of the centre. A large ball faces the camera. To first order, a depth is no more of the
+than the low-pass eps, its plane turns towards the camera instead of running to infinity, for which 2D Gaussian
+Splatting takes the depth of the centre. A large ball faces the camera. To first order, a depth is no more of the
 primitive's deviations of depth away from the mean's than its pixel is of deviations in the image.
 """
 

@@ -1,4 +1,4 @@
-"""The population of ellipses, lines and triangles, and how it begins: near points of like colour become one.
+"""The population of ellipses, lines and triangles, and its start: near points of similar colour become one.
 
 MP-GS clusters points hierarchically into groups of one, two or three, and makes each an ellipse, a line or a triangle.
 Here two points may join if one is among the three nearest neighbours of the other, no further than twice as far as the
@@ -19,7 +19,7 @@ from minisplat_ref.types import Floats, Gaussians, Ints
 COLOR_DISTANCE = 5.0  # in Lab, the paper's
 N_NEIGHBOURS = 3
 REACH = 2.0  # of a pair, in distances of the nearest neighbours
-SHRINK = 0.5  # of a group's deviations: its hull spans what lay between its points
+SHRINK = 0.5  # of a group's deviations: its hull spans the space between its points
 SRGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 LAB_KNEE = 6 / 29
 

@@ -1,8 +1,8 @@
 """OMG: few Gaussians that differ from their neighbours, with networks and codebooks.
 
-This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps what is important to
-the photographs, but of two important Gaussians side by side that look the same, one would suffice. So the pruning score
-is multiplied by the difference of a Gaussian's colour from its neighbours' in Morton order
+This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps the Gaussians that are
+important to the photographs, but of two important Gaussians side by side that look the same, one would suffice. So the
+pruning score is multiplied by the difference of a Gaussian's colour from its neighbours' in Morton order
 (:mod:`minisplat_ref.extensions.omg.reference`),
 
     S_i = I_i LD_i^lambda,   LD_i = mean_channels |c_i - c_prev| + |c_i - c_next|,   lambda = 2

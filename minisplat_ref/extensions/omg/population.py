@@ -18,7 +18,7 @@ from minisplat_ref.mechanisms.networks.mlp import make_network, network_rates, t
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.types import Floats, Gaussians, Scene
 
-N_STATIC, N_VIEW = 3, 3  # features of a Gaussian: T, for colour and opacity, and V, for what depends on the view
+N_STATIC, N_VIEW = 3, 3  # features of a Gaussian: T, for colour and opacity, and V, for view dependence
 N_SPACE = 13  # features of a place, F
 N_OCTAVES = 16
 HIDDEN = 64

@@ -45,7 +45,7 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
     Parameters
     ----------
     vectors : ndarray of shape (N, D)
-        Finite, at most 65504 in magnitude, which is what float16 holds.
+        Finite, at most 65504 in magnitude, the largest float16.
     width : int
         w, numbers per part; it divides D.
     n_codes : int

@@ -9,7 +9,7 @@ NAME codes       the codes that are in use, half floats
 networks         weights and biases of all networks, one after the other, half floats
 ===============  ==========================================================================
 
-Codebooks and weights lose what half floats lose; the rest is as it was trained. Opacity, colour and harmonics are
+Codebooks and weights are rounded to half floats; the rest is as it was trained. Opacity, colour and harmonics are
 products of matrices, so their last digits depend on the machine.
 """
 

@@ -12,8 +12,8 @@ The ray of each pixel takes alpha where it hits the polygon:
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
 (``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with a polygon instead of an ellipsoid
-(:mod:`.ray_kernels`, in NumPy :mod:`.reference`). An edited polygon may be bent, and then the triangles between its
-centre and two neighbouring corners are what a ray hits (:mod:`.kernels`); of a flat one, both give the same hits.
+(:mod:`.ray_kernels`, in NumPy :mod:`.reference`). An edited polygon may be bent, and then a ray hits the triangles
+between its centre and two neighbouring corners (:mod:`.kernels`); of a flat one, both give the same hits.
 
 A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The corners of an edited polygon are fitted by
 spans, whose ellipse is the Gaussian. Every affine edit is carried exactly.

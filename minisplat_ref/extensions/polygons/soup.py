@@ -7,7 +7,7 @@ the opacity and the colour of degree 0 of its Gaussian. Gaussians that are too f
 After an edit, face m lists the vertices that are the corners of polygon m, in the order in which they were written.
 Edited polygons are fitted (:func:`~minisplat_ref.mechanisms.meshes.fans.fit_flat_gaussians`): means, quaternions
 and scales. The thickness keeps its ratio to the smaller of the two scales, so that the plane stays the plane. Higher
-harmonics are rotated by the rotation that is nearest to what happened to the plane. Opacities, and with them the radii,
+harmonics are rotated by the rotation that is nearest to the map of the plane. Opacities, and with them the radii,
 stay. A polygon has two sides that look the same: a mirrored one counts as turned over, and colours are never mirrored.
 """
 

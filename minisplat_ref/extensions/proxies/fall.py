@@ -74,7 +74,7 @@ def sheet_of(mesh: Mesh, setting: Setting) -> Sheet:
     if setting.drop is not None:
         height = float((mesh.vertices @ (-setting.gravity / g)).min()) - setting.drop
         k = float(masses.mean()) * g / (FLOOR_DEPTH * float(springs.rest_lengths.mean()))
-        floor = Floor(height, k, drag=2 * float(np.sqrt(k / masses.mean())))  # critical: no vertex bounces by itself
+        floor = Floor(height, k, drag=2 * float(np.sqrt(k / masses.mean())))  # critical: no vertex bounces alone
     return Sheet(masses, springs, setting.is_pinned, setting.gravity, setting.drag, floor)
 
 

@@ -1,4 +1,4 @@
-"""The affine camera that fits a sensor best, and how far it is from the sensor (EOGS, Sec. 3.1).
+"""The affine camera that fits a sensor best, and its error (EOGS, Sec. 3.1).
 
 World coordinates are metres of UTM from a centre, over a scale. Pixels and altitude of the sensor are affine in them::
 

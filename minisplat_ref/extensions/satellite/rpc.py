@@ -93,7 +93,7 @@ def localise(rpc: RPC, pixels: Floats, heights: Floats) -> Floats:
     wanted = (pixels - 0.5 - rpc.pixel_offset) / rpc.pixel_scale
     x = np.zeros((len(pixels), 3))
     x[:, 2] = (heights - rpc.ground_offset[2]) / rpc.ground_scale[2]
-    with np.errstate(all="ignore"):  # what does not converge is refused below
+    with np.errstate(all="ignore"):  # points that do not converge are refused below
         for _ in range(N_NEWTON):
             m, dm = _monomials(x)
             q = m @ rpc.denominators.T  # [N, 2]

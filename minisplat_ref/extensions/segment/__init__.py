@@ -25,7 +25,7 @@ This deviates from the paper as follows. Masks of a view show the label of the l
 depths. --extract and --remove separate one object from the rest, so that a Gaussian may belong to two; the labels of
 the PLY are a partition.
 
-Left out is what makes masks: there is no tracker and no network here.
+Left out is the making of masks: there is no tracker and no network here.
 """
 
 from minisplat_ref.extensions.extension import Extension

@@ -44,7 +44,7 @@ def read_subject(path: Path, cameras: Path | None = None) -> Subject:
     Raises
     ------
     InputError
-        There is no model or there are no cameras, or the renderer needs what no PLY holds.
+        There is no model or there are no cameras, or the renderer needs parameters that no PLY holds.
     """
     file = model_file(path)
     label = read_label(file)

@@ -16,7 +16,7 @@ from minisplat_ref.strategy.ops import Edit, concat, n_rows, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 SHRINK = 1.6
-"""What a scale is divided by where two children share it, as in 3DGS; a row of four divides it by the square."""
+"""The divisor of a scale that two children share, as in 3DGS; a row of four divides it by the square."""
 GRIDS = {4: (2, 2), 8: (4, 2)}
 """Children along the longest and the second axis, by their number."""
 

@@ -146,7 +146,7 @@ def recolor(gaussians: Gaussians, color_map: ColorMap) -> Gaussians:
 
 
 def _pixels(scene: Scene) -> Floats:
-    """Return colours [P, 3] in [0, 1], evenly from all photographs, without what masks leave out."""
+    """Return colours [P, 3] in [0, 1], evenly from all photographs, without masked pixels."""
     rows = [view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask] for view in scene.train_views]
     stride = max(1, sum(map(len, rows)) // N_PIXELS)
     return np.concatenate([row[::stride] for row in rows]) / 255

@@ -1,4 +1,4 @@
-"""Surfels with textures: fields, how they start from surfels with one material, and textures of another size.
+"""Surfels with textures: fields, their start from surfels with one material, and textures of another size.
 
 A texture has T x T texels. A field holds those of all its channels in a row of numbers: the texel in row j, along the
 disc's second axis, and column i, along the first, has its channel c in column ``(j T + i) C + c``.

@@ -1,4 +1,4 @@
-"""Textures on discs, in NumPy: where a hit reads them, the normals that they hold, and how they are blended.
+"""Textures on discs, in NumPy: the places that a hit reads, the normals that they hold, and their blending.
 
 A ray hits a disc at (u, v), in standard deviations (:mod:`minisplat_ref.mechanisms.surfels.response`). A texture of
 T x T texels covers |u|, |v| <= 4 with its outer texels on the border, and is read linearly between texels; those
@@ -101,7 +101,7 @@ def blend_texels_vjp(
         behind_g  = sum_{j behind g} w_j (X_j . v)
         v_alpha_g = T_g (X_g . v) - behind_g / (1 - alpha_g)
 
-    and from there to the surfels, as for colours; (u, v) adds to what moves a hit.
+    and from there to the surfels, as for colours; (u, v) adds to the gradient that moves a hit.
     """
     response, n = surfel_response(Layout()), len(texels)
     v_T, v_c, v_o = np.zeros((n, 3, 3)), np.zeros((n, 2)), np.zeros(n)

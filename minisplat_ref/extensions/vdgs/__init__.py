@@ -18,7 +18,7 @@ published modes, ``both_times`` and ``both_plus`` change opacity and colour (:mo
     minisplat-ref oracle gradients --extension vdgs
 
 A run keeps the network in ``shared.npz``. A PLY does not hold it, and has a note of that: rendered without the run, the
-Gaussians are those of 3DGS with y = 0. ``vdgs bake`` writes what one view sees.
+Gaussians are those of 3DGS with y = 0. ``vdgs bake`` writes the Gaussians of one view.
 
 This deviates from the paper as follows. The factor is 1 + y instead of y, and the last layer starts at 0, so that a
 training begins as 3DGS and without an output is 3DGS exactly. An opacity is kept between 1e-4 and 0.99; one above 0.99

@@ -63,7 +63,7 @@ def n_outputs(mode: Mode) -> int:
 
 def initial_shared(scene: Scene, rng: np.random.Generator, *, modulation: Callable[[], Mode]) -> Mapping[str, Floats]:
     """Return the network, whose last layer is 0, the hash grid, and the bounds of the scene, float32."""
-    (rng,) = rng.spawn(1)  # so that the training draws what one of 3DGS does
+    (rng,) = rng.spawn(1)  # so that the training draws the random numbers of one of 3DGS
     levels = make_levels(N_LEVELS, COARSEST, FINEST, n_rows=N_ROWS, n_features=N_FEATURES)
     network = make_network((3 + N_LEVELS * N_FEATURES, HIDDEN, n_outputs(modulation())), rng)
     last = Layer(*(np.zeros_like(array) for array in network[-1]))

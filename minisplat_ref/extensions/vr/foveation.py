@@ -101,7 +101,7 @@ def zone_weights(eccentricities: Floats, full: float) -> list[Floats]:
     weights, rest = [], np.ones_like(eccentricities)
     for begins in zone_begins(full)[1:]:
         t = np.clip((eccentricities - begins) / max(RING * begins, 1e-9), 0, 1)
-        share = t * t * (3 - 2 * t)  # of what is coarser
+        share = t * t * (3 - 2 * t)  # of coarser pixels
         weights.append(rest * (1 - share))
         rest = rest * share
     return [*weights, rest]

@@ -82,7 +82,7 @@ def blend_fast(scene: Scene, grid: Grid, wavelength: float, channel: int) -> Com
 
 
 def center_transmittances(scene: Scene) -> Floats:
-    """Return t [N], what those in front leave at the centre of each Gaussian."""
+    """Return t [N], the transmittance in front of the centre of each Gaussian."""
     centers, precisions = scene.flats.centers[:, :2], np.linalg.inv(scene.flats.lateral_covariances)
     t = np.ones(len(centers))
     for j in range(len(centers)):  # on all that are behind

@@ -62,7 +62,7 @@ class Box(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A scene in its box, with counts of what could not be kept."""
+    """A scene in its box, with counts of the Gaussians that could not be kept."""
 
     scene: Scene
     box: Box

@@ -26,7 +26,7 @@ from minisplat_ref.types import Floats, Ints
 
 N_PLANES = 64
 REACH = 4.5  # standard deviations from the centre of a window to its side: exp(-REACH^2 / 2) = 4e-5
-MARGIN = 4  # pixels besides, for what diffraction spreads on the way to the nearest plane
+MARGIN = 4  # pixels besides, for the spread by diffraction on the way to the nearest plane
 
 
 class Window(NamedTuple):
