@@ -1,4 +1,4 @@
-"""The inventory of a scene's folder, what is used of it and what is not: one line for ``info`` and ``train``.
+"""The inventory of a scene's folder, with its used and its unused files: one line for ``info`` and ``train``.
 
 A scene loads without a mask whose name does not fit, without photographs that have no camera, and from the first of two
 models. Each may be intended, so none is refused; but a user who expects it to be used has to hear that it is not.
@@ -114,7 +114,7 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _other_models(path: Path, model: Path, n_images: int) -> list[str]:
-    """Name other models, and what to do if one has more images than the one that is used."""
+    """Name other models, with advice if one has more images than the one that is used."""
     said = []
     ours = model.relative_to(path).as_posix()
     for folder in (path / "sparse", *_folders(path / "sparse")):
@@ -163,7 +163,7 @@ def _differences(
     views: Mapping[str, View],
     common: Sequence[str],
 ) -> Iterable[str]:
-    """Yield what differs between the frames of a file and the views of the same names."""
+    """Yield the differences between the frames of a file and the views of the same names."""
     if not common:
         yield "other images"
         return
