@@ -31,7 +31,7 @@ def assert_matches_oracle(
     profile: Conventions = GSPLAT_MAIN,
     has_gradients: bool = True,
 ) -> Report:
-    """Assert that a rasterizer computes what the float64 reference does, stage by stage, forward and backward.
+    """Assert that a rasterizer agrees with the float64 reference, stage by stage, forward and backward.
 
     Parameters
     ----------
@@ -40,16 +40,16 @@ def assert_matches_oracle(
         ``scales`` [N, 3], ``opacities`` [N], ``colors`` [N, K, 3] with ``sh_degree``, or [N, D], ``viewmats``
         [1, 4, 4], ``Ks`` [1, 3, 3], ``width``, ``height``, ``backgrounds`` [1, D]; of its options those that the
         function has. Returns ``render_colors`` [1, H, W, D] and ``render_alphas`` [1, H, W, 1], and perhaps a mapping
-        with gsplat's keys, such as ``means2d``: what is in it is compared as well, and a failure is placed better.
+        with gsplat's keys, such as ``means2d``: its entries are compared as well, and a failure is located better.
     vjp : callable, optional
         Takes the same, ``v_render_colors`` and ``v_render_alphas``; returns a dict of ``v_means`` and so on. Without it
         torch and JAX differentiate the function.
     scenes : sequence of str
         Names, of those that ``minisplat-ref oracle compare --help`` lists; by default all that the function can render.
     arrays : {"numpy", "torch", "jax"}, optional
-        What to call it with; by default what its module has imported.
+        The kind of its arguments; by default the one that its module has imported.
     dtype : {"float32", "float64"}
-        What it computes in, and so the tolerances.
+        The dtype of its computation, and so the tolerances.
     profile : Conventions
         Its rules, where the scenes leave a choice, such as ``GSPLAT_1_5``, which clamps alpha at 0.999.
     has_gradients : bool

@@ -4,7 +4,7 @@ The photographs, sorted by name, fall into K folds: fold k holds out every K-th,
 photograph is treated as if it had not been taken, except that its camera is known: sparse points that fewer than two of
 the other photographs have found are left out. Each photograph is measured as rendered and after the best affine map of
 its colours, because nothing says what exposure it had; and once more in the pixels that at least two training
-photographs show (:mod:`.coverage`), because the others are guessed.
+photographs show (:mod:`.kit.coverage`), because the others are guessed.
 
 Several scenes may be given. Then the first recipe is also compared, fold by fold, with the best other one of the scene,
 and a recipe is chosen as one must: on the other scenes, to be reported on the one left out. The claim is ours;

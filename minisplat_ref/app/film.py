@@ -18,7 +18,7 @@ N_COLORS = 256  # a GIF holds no more in a frame
 MP4_OPTIONS: dict[str, Any] = {
     "format": "FFMPEG",
     "codec": "libx264",
-    "pixelformat": "yuv420p",  # which every player knows
+    "pixelformat": "yuv420p",  # which every player supports
     "quality": 8,  # of 10
     "macro_block_size": 2,  # yuv420p has even widths and heights
 }

@@ -1,7 +1,7 @@
-"""What lies in the folder of a scene, how much of it is used, and what is not: one line for ``info`` and ``train``.
+"""The inventory of a scene's folder, with its used and its unused files: one line for ``info`` and ``train``.
 
 A scene loads without a mask whose name does not fit, without photographs that have no camera, and from the first of two
-models. Each may be meant, so none is refused; but whoever expects it to be used has to hear that it is not.
+models. Each may be intended, so none is refused; but a user who expects it to be used has to hear that it is not.
 """
 
 import math
@@ -37,12 +37,12 @@ FOCAL_TOLERANCE, PLACE_TOLERANCE = 0.005, 0.02  # relative; two calibrations of 
 
 
 class Inventory(NamedTuple):
-    """What was found beside what is used."""
+    """The findings about a folder."""
 
     used: str
-    """How many photographs have cameras."""
+    """The number of photographs that have cameras."""
     unused: tuple[str, ...]
-    """What is there and is not used, half a sentence each."""
+    """Files that are not used, half a sentence each."""
 
     @property
     def line(self) -> str:
@@ -51,7 +51,7 @@ class Inventory(NamedTuple):
 
 
 def take_inventory(path: Path, scene: Scene, model: str | None = None) -> Inventory:
-    """Compare the folder of a scene with what has been loaded from it.
+    """Compare the folder of a scene with the scene that was loaded from it.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def take_inventory(path: Path, scene: Scene, model: str | None = None) -> Invent
     scene : Scene
         In the frame of its files or another.
     model : str, optional
-        The model that was asked for.
+        The requested model.
     """
     folder = find_model(path, model)
     return _of_transforms(path) if folder is None else _of_colmap(path, folder, scene)
@@ -94,7 +94,7 @@ def _images_in(folder: Path) -> set[str]:
 
 
 def _unused_masks(path: Path, names: Iterable[str]) -> list[str]:
-    """Say for each folder of masks how many of its files are masks of photographs, unless all are."""
+    """Report for each folder of masks how many of its files are masks of photographs, unless all are."""
     said = []
     fitting = {form.casefold() for name in names for form in (f"{name}.png", Path(name).with_suffix(".png").as_posix())}
     for folder in _folders(path):
@@ -114,7 +114,7 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _other_models(path: Path, model: Path, n_images: int) -> list[str]:
-    """Name other models, and what to do if one has more images than the one that is used."""
+    """Name other models, with advice if one has more images than the one that is used."""
     said = []
     ours = model.relative_to(path).as_posix()
     for folder in (path / "sparse", *_folders(path / "sparse")):
@@ -126,7 +126,7 @@ def _other_models(path: Path, model: Path, n_images: int) -> list[str]:
 
 
 def _own_splits(folders: Iterable[Path]) -> list[str]:
-    """Name files that say which photographs are for testing."""
+    """Name files that list the photographs for testing."""
     files = sorted(
         file.name
         for folder in folders
@@ -138,7 +138,7 @@ def _own_splits(folders: Iterable[Path]) -> list[str]:
 
 
 def _disagreement(path: Path, model: Path, names: Iterable[str], scene: Scene) -> list[str]:
-    """Say in which way a transforms.json beside a model describes other cameras."""
+    """Describe how the cameras of a transforms.json beside a model differ from the model's."""
     files = find_transforms(path)
     if not files:
         return []
@@ -163,7 +163,7 @@ def _differences(
     views: Mapping[str, View],
     common: Sequence[str],
 ) -> Iterable[str]:
-    """Yield what differs between the frames of a file and the views of the same names."""
+    """Yield the differences between the frames of a file and the views of the same names."""
     if not common:
         yield "other images"
         return
@@ -178,7 +178,7 @@ def _differences(
 
 
 def _focal_share(frame: Mapping[str, Any], camera: Camera) -> float:
-    """Return how many times as long the focal length of a frame is, 1 where it does not say; both as parts of a width.
+    """Return the ratio of a frame's focal length to the model's, 1 where it has none; both as fractions of a width.
 
     The photographs of the two may have other sizes.
     """
@@ -229,7 +229,7 @@ def _of_transforms(path: Path) -> Inventory:
 
 
 def _unnamed_masks(folder: Path, masks: set[str]) -> list[str]:
-    """Say for each folder of masks how many of its files the frames name, unless all are."""
+    """Report for each folder of masks how many of its files the frames name, unless all are named."""
     said = []
     for place in _folders(folder):
         files = _images_in(place) if MASK_FOLDERS.fullmatch(place.name) else set()
@@ -255,7 +255,7 @@ def _splits_of(files: Sequence[Path], sets: Sequence[Mapping[str, Any]], stems: 
 
 
 def _count_others(file: Path, stems: set[str]) -> int:
-    """Return how many frames of a file are of images that others do not list; 0 if it is no such file."""
+    """Return the number of frames of a file whose images others do not list; 0 if it is no such file."""
     try:
         frames = read_transforms(file)["frames"]
     except InputError:
@@ -270,7 +270,7 @@ def _stem(folder: Path, frame: Mapping[str, Any]) -> str:
 
 
 def _clouds_of(file: Path, transforms: Mapping[str, Any]) -> list[str]:
-    """Say that a cloud lacks colours that we know, or is there and not named."""
+    """Report point clouds that lack colours or are not referenced."""
     points = find_points(file, transforms)
     if points is None:
         there = [name for name in CLOUDS if (file.parent / name).is_file()]

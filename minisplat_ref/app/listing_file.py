@@ -31,8 +31,8 @@ def select(listing: Listing, names: Collection[str]) -> Listing:
     Returns
     -------
     Listing
-        In the order of the listing, without test photographs. All points remain where a photograph does not know which
-        it shows.
+        In the order of the listing, without test photographs. All points remain where it is unknown which of them a
+        photograph shows.
     """
     chosen = [pair for pair in zip(listing.names, listing.train_photos, strict=False) if pair[0] in names]
     photos = [photo for _, photo in chosen]

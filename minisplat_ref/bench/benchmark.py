@@ -42,7 +42,7 @@ class Entry(NamedTuple):
     verdict: Verdict
     """Errors against the reference with the default cut-off."""
     failure: str
-    """Why it is wrong, empty if it is right."""
+    """The error that makes it wrong, empty if it is right."""
     times: Times
     """Empty if it is wrong."""
 
@@ -142,7 +142,7 @@ def _least(seconds: list[float]) -> float | None:
 
 
 def _ratio(baseline: list[float], own: list[float]) -> float | None:
-    """Return how many times faster than the baseline it is, by the least times."""
+    """Return its speed relative to the baseline, by the shortest times."""
     return min(baseline) / min(own) if baseline and own else None
 
 

@@ -1,4 +1,4 @@
-"""What draws the workloads: backends in their precisions, other exponentials, shorter cut-offs, the baseline.
+"""The contenders: backends in their precisions, other exponentials, shorter cut-offs, the baseline.
 
 A shorter cut-off gives another image on purpose. It is judged by the float64 kernels with the same cut-off; the
 reported error is the one that matters to its user, against the reference with the default cut-off.
@@ -40,7 +40,7 @@ DEGREE_IN_USE = 5
 
 
 class Contender(NamedTuple):
-    """A way to draw, and its error bounds."""
+    """A way to render, and its error bounds."""
 
     name: str
     """Unique."""
@@ -124,7 +124,7 @@ def _on_gpu(name: str) -> Contender:
     Raises
     ------
     InputError
-        There is none, or the simulator takes its place, whose times say nothing.
+        There is none, or only the simulator, whose times are meaningless.
     """
     backend = get_backend(ON_GPU[name])
     if backend.residence.is_simulated:

@@ -1,12 +1,12 @@
-"""What an extension's renderer costs: forward and backward on both backends, each beside its error.
+"""The time of an extension's renderer, forward and backward on both backends, with its error.
 
 The truth is its own result on the reference in float64. Beside it are the renderer of 3DGS by the plain kernels, which
 an extension's response runs in, by the tuned ones and by the textbook loop, on the same Gaussians, with errors against
 3DGS's own reference.
 
 In float32 a hit may fall on the other side of a threshold, and two hits of nearly one depth change places. A user's
-renderer does not say where its thresholds are, so such pixels cannot be set aside by name: what is judged is
-the part of the pixels that are off, and the root mean square over the others.
+renderer does not report its thresholds, so such pixels cannot be set aside one by one: judged are the fraction of
+pixels that are off, and the root mean square error over the others.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ class Row(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a row draws and how it is differentiated."""
+    """The forward and backward pass that a row times."""
 
     image: Floats
     gradient: dict[str, Floats]
@@ -58,7 +58,7 @@ def extension_cases(
     repeats : int
         Turns of each row; the references, which give the answers, take one.
     report : callable
-        Called with a line on what is being done.
+        Called with a line about the current step.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def extension_cases(
 
 
 class _Steps:
-    """A row on a workload: its forward pass, and the backward pass of what that drew last."""
+    """A row on a workload: its forward pass, and the backward pass of the latest forward pass."""
 
     def __init__(self, row: Row, workload: Workload) -> None:
         gaussians = Gaussians._make(field.astype(row.dtype) for field in workload.gaussians)

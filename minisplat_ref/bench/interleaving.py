@@ -2,7 +2,7 @@
 
 A shared machine is disturbed for seconds at a time: other work slows a thread down, and makes a second thread gain
 less. Tasks timed one after the other would each run under other conditions. So tasks that are compared alternate, and
-all run in every round. The least time is that of an idle machine, the median what to expect of this one.
+all run in every round. The least time is that of an idle machine, the median that of this machine as it is used.
 """
 
 import statistics

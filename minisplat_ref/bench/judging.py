@@ -1,4 +1,4 @@
-"""Does a contender draw correctly? Errors against float64 on the same numbers, apart from flips at thresholds."""
+"""Errors of a contender against float64 on the same numbers, apart from flips at thresholds."""
 
 import time
 from typing import Any, NamedTuple
@@ -43,7 +43,7 @@ class Verdict(NamedTuple):
     n_flips: int
     """Pixels at thresholds with an error above the bound."""
     n_wrong: int
-    """Pixels with an error above the bound and above what their thresholds can explain."""
+    """Pixels with an error above the bound and above the effect of their thresholds."""
     gradient: float
     """Largest relative L2 error of any parameter's gradient."""
     quiet_gradient: float
@@ -104,7 +104,7 @@ def judge(contender: Contender, workload: Workload, expected: Expected) -> Verdi
 
 
 def failure(contender: Contender, verdict: Verdict) -> str:
-    """Say in one line what is wrong; return an empty string if nothing is."""
+    """Return the error in one line, or an empty string if there is none."""
     if verdict.n_wrong:
         return f"{verdict.n_wrong} pixels are off by more than {contender.image_bound:.1e} and no threshold explains it"
     if not verdict.quiet_gradient <= contender.gradient_bound:
@@ -122,7 +122,7 @@ def forward(contender: Contender, workload: Workload) -> tuple[Floats, Any]:
 
 
 def backward(contender: Contender, tape: Any, v_image: Floats) -> Gaussians:
-    """Differentiate what :func:`forward` drew."""
+    """Differentiate the image of :func:`forward`."""
     return contender.passes.backward(tape, v_image.astype(contender.dtype, copy=False))
 
 

@@ -1,4 +1,4 @@
-"""What small networks and encodings cost: kernels beside NumPy, forward and gradient, on as many rows as a scene has.
+"""The time of small networks and encodings: kernels and NumPy, forward and gradient, on as many rows as a scene has.
 
 The sizes are those of OMG's networks and of a hash grid of four levels. NumPy's products are BLAS's. Every kernel is
 checked against NumPy in float64 in the same run, with a bound on the largest error relative to the largest result.

@@ -1,4 +1,4 @@
-"""The public functions that draw a workload and differentiate it: ``render``, or gsplat's call on activated Gaussians.
+"""Public functions that render a workload and differentiate it: ``render``, or gsplat's call on activated Gaussians.
 
 Both start from parameters and end with their gradient, so that their times can be compared: activations count in both.
 ``rasterization_vjp`` keeps nothing of the forward pass, because of gsplat's signature; it renders once more, which
@@ -22,7 +22,7 @@ class Passes(NamedTuple):
     """A forward pass and its backward pass."""
 
     forward: Callable[[Gaussians, Camera, Conventions, Backend], tuple[Floats, Any]]
-    """From parameters to the image [H, W, 3], and what ``backward`` needs."""
+    """From parameters to the image [H, W, 3], and the values that ``backward`` needs."""
     backward: Callable[[Any, Floats], Gaussians]
     """From that and the image's derivative to the parameters'."""
 

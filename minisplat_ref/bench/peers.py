@@ -29,7 +29,7 @@ def peers_of(names: Sequence[str]) -> tuple[list[Contender], Path | None]:
     Returns
     -------
     contenders : list of Contender
-        Those that draw the workloads.
+        Those that render the workloads.
     opensplat : Path or None
         OpenSplat's executable, which only trains.
 

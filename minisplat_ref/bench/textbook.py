@@ -1,11 +1,11 @@
 """The baseline: blending as a textbook writes it, one loop per pixel over the Gaussians of its tile.
 
-This is deliberately the only other implementation of blending besides the reference and the kernels: it is what a
-careful student would write after reading 3DGS, and measures the gain of the real kernels' design. It is correct,
-parallel over tiles, and uses none of their tricks: it has scalar ``math.exp``, branches, 16 x 16 tiles listed by boxes,
-and a backward pass from back to front that recovers the transmittance by division. Literals are float64, so float32
-data are blended in float64. Projection, colours and loss are those of the CPU backend, the tile lists those of the
-reference. Left out: blend statistics, conventions other than the default's.
+This is deliberately the only other implementation of blending besides the reference and the kernels: a careful student
+would write it after reading 3DGS, and it measures the gain of the real kernels' design. It is correct, parallel over
+tiles, and uses none of their tricks: it has scalar ``math.exp``, branches, 16 x 16 tiles listed by boxes, and a
+backward pass from back to front that recovers the transmittance by division. Literals are float64, so float32 data are
+blended in float64. Projection, colours and loss are those of the CPU backend, the tile lists those of the reference.
+Left out: blend statistics, conventions other than the default's.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""How many rows of eight pixels the blending kernels compute: their work, apart from how fast they do it."""
+"""The number of rows of eight pixels that the blending kernels compute: their work, as distinct from their speed."""
 
 import numpy as np
 
@@ -53,7 +53,7 @@ def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-d
 
 
 def count_worked_rows(projection: Projection, channels: Floats, bins: TileBins) -> int:
-    """Return how many rows of eight pixels the blending kernels compute, all Gaussians and tiles together."""
+    """Return the number of rows of eight pixels that the blending kernels compute, over all Gaussians and tiles."""
     records = records_of(projection, channels, GSPLAT_MAIN)
     frame = frame_of(bins, GSPLAT_MAIN, records.dtype)
     return int(_count_rows(records, bins.gaussian_ids, bins.tile_offsets, frame))

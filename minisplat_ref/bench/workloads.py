@@ -23,7 +23,7 @@ GARDEN_SUBSET = 20_000
 
 
 class Workload(NamedTuple):
-    """One view to draw, and what to differentiate."""
+    """One view to render, and the cotangent for its gradient."""
 
     name: str
     """Key in reports."""

@@ -1,4 +1,4 @@
-"""Process eight Gaussians together: which rows of the tables they are, and their numbers as lanes.
+"""Process eight Gaussians together: their rows in the tables, and their numbers as lanes.
 
 The forward pass loops over all Gaussians in order; the backward pass, and colours, over a list of those that the camera
 sees. Copies of the last row of a range pad the last eight. Writing the same values to it several times is harmless;

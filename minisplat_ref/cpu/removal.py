@@ -1,4 +1,4 @@
-"""How much the image would change without each Gaussian; see ``reference.removal``.
+"""The change of the image without each Gaussian; see ``reference.removal``.
 
 The loop is that of :mod:`minisplat_ref.cpu.compositing.backward`: front to back, with the arithmetic of the forward
 pass. Each channel keeps its own light from behind the current hit, because the square of a sum over channels would be

@@ -3,7 +3,7 @@
 Eight Gaussians are processed together. The formulas need the same coefficient of all eight, but in memory the
 coefficients of one Gaussian are contiguous. They are therefore transposed in small buffers that stay in the cache, and
 copied to and from memory row by row: processors prefetch a single stream, but not eight rows read column by column.
-Work is proportional to what the camera sees and to the coefficients that there are: each chunk of Gaussians loops,
+Work is proportional to the number of visible Gaussians and of their coefficients: each chunk of Gaussians loops,
 degree by degree, over a list of the visible ones of that degree.
 
 Helpers have no loops and no branches: the compiler would count references of the arrays that such a helper is given,
@@ -173,7 +173,7 @@ def _zero_culled(first, end, radii, v):
 def _loop_over_chunk(has_gradient: bool) -> Callable:
     """Return the loop over the Gaussians of one degree: it writes their colours, or with a gradient chains it.
 
-    One function for both, because a helper for what they share would itself loop over the coefficients.
+    One function for both, because a helper for their shared part would itself loop over the coefficients.
     """
 
     @scalar

@@ -1,4 +1,4 @@
-"""The photographs of the measured pages: where they are published, under which licence, and how scenes became of them.
+"""The photographs of the measured pages: their sources, their licences, and the commands that make scenes of them.
 
 Each set lies in a public repository and is named by its commit, so that its files never change; ``catalogue.sha256``
 has the hash of every file at that commit. One scene of the measured pages is missing, banana_blender, which was cut out
@@ -29,7 +29,7 @@ class File(NamedTuple):
 
     url: str
     path: str
-    """Where it comes to lie in the folder of the set."""
+    """Its path in the folder of the set."""
     n_bytes: int
     sha256: str
 
@@ -38,20 +38,20 @@ class DataSet(NamedTuple):
     """Photographs, or other data, at a commit of a public repository."""
 
     what: str
-    """What it shows, in a line."""
+    """Its subject, in a line."""
     repository: str
     commit: str
     licence: str
     licence_file: str
     """In the repository; it is fetched as well."""
     next_command: tuple[str, ...]
-    """What makes the measured scene of it; ``{}`` stands for the folder of the set."""
+    """The command that makes the measured scene of it; ``{}`` is the folder of the set."""
     folder: str = PHOTOS
-    """Where its other files come to lie."""
+    """The folder of its other files."""
 
     @property
     def page(self) -> str:
-        """Address to look at it."""
+        """Address of its web page."""
         return f"{PAGES}/{self.repository}/tree/{self.commit[:7]}"
 
 

@@ -1,4 +1,4 @@
-"""A scene by what a user types: the folder of photographs with cameras, or the name of a synthetic one."""
+"""A scene by the user's argument: a folder of photographs with cameras, or the name of a synthetic scene."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def read_scene(source: str, downscale: int = 1, *, is_tested: bool = True) -> Sc
     Raises
     ------
     InputError
-        ``source`` is neither, has no test views, or is a synthetic scene that is to be made smaller.
+        ``source`` is neither, has no test views, or is a synthetic scene although a smaller size is requested.
     """
     if Path(source).exists():
         scene = load_scene(source, downscale=downscale)

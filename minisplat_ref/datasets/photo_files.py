@@ -1,4 +1,4 @@
-"""Find the photographs in a folder, and leave out what programs have put beside them.
+"""Find the photographs in a folder, and leave out files that programs have put beside them.
 
 Cameras, phones and file managers leave previews and hidden copies (``._0001.jpg`` of macOS, ``@eaDir`` of a network
 disk, ``.thumbnails``). A scene has masks and smaller copies (``masks/``, ``images_2/``). They end like photographs, but

@@ -27,7 +27,7 @@ from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
 from minisplat_ref.io.transforms import find_frames, find_points, find_transforms, read_transforms
 from minisplat_ref.types import Camera
 
-# What a transforms.json says about lenses; every frame gets its pinhole's entries instead.
+# Entries of a transforms.json about lenses; every frame gets its pinhole's entries instead.
 LENS_KEYS = (
     *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye"),
     *("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h"),
@@ -97,7 +97,7 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
         shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")
     reading = build_reading(1, None, undistort=True, alpha_is_mask=True)
     for photo in with_progress(photos, "undistorting", "masks"):
-        # COLMAP does not write every format that the loader reads (not WebP), and does not say so.
+        # COLMAP does not write every format that the loader reads (not WebP), and gives no error.
         is_missing = not (out / "images" / photo.file).is_file()
         if is_missing or _has_mask(photo):
             view = read_view(photo, photo.file, reading)

@@ -1,8 +1,8 @@
-"""Photographs from a video: of every few frames the sharpest one.
+"""Photographs from a video: the sharpest of every few frames.
 
 A hand that holds a camera moves unevenly, so of neighbouring frames some are sharp and some are blurred. Sharpness is
-the mean square of the Laplacian of the brightness: between frames of one place it falls with blur, while its value says
-nothing between places.
+the mean square of the Laplacian of the brightness: between frames of one place it falls with blur, while values of
+different places cannot be compared.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ SECONDS = 0.5  # of a video, from which one frame is kept
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a path is a file whose suffix is a video's."""
+    """Return whether a path is a file with the suffix of a video."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
@@ -74,7 +74,7 @@ def _write(folder: Path, best: tuple[float, int, NDArray[np.uint8]]) -> Path:
 
 
 def _read(video: Path, every: int | None) -> tuple[Iterator[NDArray[np.uint8]], int]:
-    """Return the frames [H, W, 3], and of how many one is to be kept."""
+    """Return the frames [H, W, 3], and the number of them of which one is kept."""
     try:
         import imageio_ffmpeg
     except ImportError:

@@ -2,7 +2,7 @@
 
 An extension is a package in this folder, or in one that the environment variable ``MINISPLAT_EXTENSIONS`` names
 (several between path separators), whose ``EXTENSION`` is an
-:class:`~minisplat_ref.extensions.extension.Extension`. Nothing registers it, and nothing in the core knows it:
+:class:`~minisplat_ref.extensions.extension.Extension`. Nothing registers it, and nothing in the core refers to it:
 ``docs/EXTENDING.md`` walks through one.
 
 This module lists the folders without loading any of them; :mod:`minisplat_ref.extensions.extension` loads them.
@@ -28,7 +28,7 @@ def folders() -> dict[str, Path]:
     Raises
     ------
     InputError
-        Two extensions have one name, or the variable names what is no folder.
+        Two extensions have one name, or the variable names something that is not a folder.
     """
     found: dict[str, Path] = {}
     for place in __path__:

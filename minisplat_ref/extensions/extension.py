@@ -1,4 +1,4 @@
-"""What an extension is, and how the extensions, and recipes by their names, are loaded."""
+"""The definition of an extension, and loaders of extensions and of recipes by name."""
 
 import sys
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class Extension(NamedTuple):
     recipes: tuple[Recipe, ...] = ()
     """Methods that train it; they get ``representation`` and ``losses`` from here."""
     representation: Representation = GAUSSIANS
-    """What is trained and how it is drawn."""
+    """The population that is trained, and its renderer."""
     losses: tuple[LossTerm, ...] = ()
     """Terms that join those of any recipe that is trained with the extension; ``--set NAME=WEIGHT`` weighs them."""
     save: Callable[[str | Path, Any, Label], None] = save_ply
@@ -43,9 +43,9 @@ class Extension(NamedTuple):
     commands: tuple[ModuleType, ...] = ()
     """Modules with ``add_parser(commands)`` and ``run(args)``: ``minisplat-ref NAME COMMAND``."""
     saves_plain: bool = False
-    """Whether ``save`` writes what 3DGS draws, and ``load`` reads the six fields: then its files have no label."""
+    """Whether ``save`` writes Gaussians of 3DGS, and ``load`` reads the six fields: then its files have no label."""
     stages: Callable[..., Any] | None = None
-    """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks, besides others."""
+    """``stages(backend, setting, rng)``: further stages that ``oracle gradients --extension NAME`` checks."""
     sample: Callable[[Gaussians, np.random.Generator], Any] | None = None
     """Makes of any Gaussians a population that exercises the renderer, for ``bench --extension NAME``; by default the
     representation's ``extend``, which may leave them as they are."""
@@ -54,13 +54,13 @@ class Extension(NamedTuple):
 
     @property
     def label(self) -> Label:
-        """What its files say about how they are drawn: nothing where 3DGS draws them."""
+        """The label of its files: none where 3DGS renders them."""
         is_plain = (self.representation.population, self.representation.renderer) == (Gaussians, SPLATTING)
         return NO_LABEL if is_plain or self.saves_plain else Label(self.name)
 
 
 CORE = Extension("core", formats=FORMATS)
-"""What there is without any extension."""
+"""The program without any extension."""
 
 
 def load_extension(name: str) -> Extension:
@@ -100,7 +100,7 @@ _PARTS: dict[str, type] = {
 
 
 def _check_parts(extension: Extension, name: str, folder: Path) -> None:
-    """Refuse an extension whose fields are not what they should be, before anything stumbles over them.
+    """Refuse an extension whose fields have wrong types or values, before anything fails because of them.
 
     Raises
     ------
@@ -127,18 +127,18 @@ def _check_parts(extension: Extension, name: str, folder: Path) -> None:
 
 
 def _takes_three(function: Callable[..., Any]) -> bool:
-    """Return whether a function can be called with three arguments: better found out now than after a training."""
+    """Return whether a function can be called with three arguments, so that an error is found before a training."""
     try:
         signature(function).bind(None, None, None)
     except TypeError:
         return False
-    except ValueError:  # it does not say
+    except ValueError:  # its signature is unknown
         return True
     return True
 
 
 def load_extensions() -> list[Extension]:
-    """Return all extensions; of one that cannot be loaded stderr says so in one line, once, and it is left out."""
+    """Return all extensions but those that cannot be loaded; stderr has one line about each of these, once."""
     extensions = []
     for name in folders():
         try:
@@ -150,7 +150,7 @@ def load_extensions() -> list[Extension]:
     return extensions
 
 
-_REPORTED: set[str] = set()  # names of extensions that could not be loaded, and of which stderr has said so
+_REPORTED: set[str] = set()  # names of extensions that could not be loaded, and were reported on stderr
 
 
 def find_recipe(name: str, iterations: int | None = None, *, extension: str | None = None) -> Recipe:

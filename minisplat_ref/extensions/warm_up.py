@@ -1,7 +1,7 @@
 """Compile the kernels of training, rendering and evaluation ahead of their use, those of extensions included.
 
-An extension needs nothing of its own for this: its renderer and its losses draw and differentiate a tiny model, after
-the stages, so that the kernels that are not its own are on disk by then. The kernels of its actions are left out.
+An extension needs no additional code for this: its renderer and its losses render and differentiate a tiny model, after
+the stages, so that the kernels of others are on disk by then. The kernels of its actions are left out.
 """
 
 from collections.abc import Generator, Iterable

@@ -1,7 +1,7 @@
-"""The arguments of gsplat's call, checked and packed: what is computed, what makes no difference, what is refused.
+"""The arguments of gsplat's call, checked and packed: some are computed, some make no difference, others are refused.
 
-gsplat's ``rasterization`` has forty keywords. Those that are not computed are refused by name where they ask for
-something: a call that gsplat answers in another way must not seem to be answered. ``docs/ORACLE.md`` has the table.
+gsplat's ``rasterization`` has forty keywords. Those that are not computed are refused by name unless they have their
+default: a call must not return another result than gsplat's in silence. ``docs/ORACLE.md`` has the table.
 """
 
 from collections.abc import Callable, Mapping
@@ -77,7 +77,7 @@ class Refused(NamedTuple):
     """A keyword that is not computed."""
 
     asks: Callable[[Any], bool]
-    """Whether a value asks for it, rather than being gsplat's default."""
+    """Whether a value requests it, rather than being gsplat's default."""
     way_out: str
 
 
@@ -122,11 +122,11 @@ REFUSED: Mapping[str, Refused] = {
 }
 """Keywords of gsplat 1.5.3 and of its main branch that are taken with their default alone."""
 NO_EFFECT = ("segmented", "channel_chunk")
-"""Keywords that change how gsplat computes, and not what; any value is taken."""
+"""Keywords that change gsplat's computation, but not its result; any value is accepted."""
 
 
 def check_refused(function: str, given: Mapping[str, Any]) -> None:
-    """Refuse what gsplat computes and we do not.
+    """Refuse options that gsplat computes and we do not.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def check_refused(function: str, given: Mapping[str, Any]) -> None:
     Raises
     ------
     InputError
-        One of them asks for something that is not computed.
+        One of them requests something that is not computed.
     TypeError
         gsplat has no such keyword.
     """
@@ -158,7 +158,7 @@ def check_options(options: Options) -> Options:
     Raises
     ------
     InputError
-        A value is unknown, or what it asks for is not computed.
+        A value is unknown, or is not computed.
     """
     if options.render_mode in HIT_DISTANCES:
         raise InputError(
@@ -182,7 +182,7 @@ def split_batches(
     primitives : tuple
         ``means`` of shape (..., N, 3), ``quats``, ``scales`` and ``opacities``.
     covars : ndarray of shape (..., N, 3, 3), or None
-        In place of quaternions and scales.
+        Instead of quaternions and scales.
     colors : ndarray or None
         Coefficients without the sizes in front are those of every scene.
     views : Views
@@ -299,7 +299,7 @@ def check_batch(
 
 
 def _symmetric(covars: Floats) -> Floats:
-    """Return the matrices that the upper triangles stand for; gsplat reads no more."""
+    """Return the symmetric matrices of upper triangles; gsplat reads no more."""
     upper = np.triu(covars)
     return upper + np.swapaxes(np.triu(covars, 1), 1, 2)
 

@@ -1,12 +1,12 @@
 """gsplat's call in NumPy: activated Gaussians and a batch of cameras in; images, opacities and gsplat's meta out.
 
-Code and tests written against ``gsplat.rasterization`` can make the same call on NumPy arrays and, in place of
-autograd, a second call that returns the gradients. There are N Gaussians, C cameras, D colour channels and K
-spherical-harmonic coefficients per channel. Colours are D given channels, or spherical harmonics of the direction from
-the camera's centre ``o = -R^-1 t``. This is the inverse, not the transpose: the twelve free entries of a view matrix
-count as independent, and R mu + t maps that point to the origin whatever they are. Arrays may have further sizes in
-front, one index for each of several scenes. What gsplat's call can do besides is refused by name
-(:mod:`minisplat_ref.gsplat.arguments`). Left out of the meta: ``isect_ids``, the keys of gsplat's own sort.
+Code and tests written against ``gsplat.rasterization`` can make the same call on NumPy arrays and, instead of autograd,
+a second call that returns the gradients. There are N Gaussians, C cameras, D colour channels and K spherical-harmonic
+coefficients per channel. Colours are D given channels, or spherical harmonics of the direction from the camera's centre
+``o = -R^-1 t``. This is the inverse, not the transpose: the twelve free entries of a view matrix count as independent,
+and R mu + t maps that point to the origin whatever they are. Arrays may have further sizes in front, one index for each
+of several scenes. Further options of gsplat's call are refused by name (:mod:`minisplat_ref.gsplat.arguments`). Left
+out of the meta: ``isect_ids``, the keys of gsplat's own sort.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -103,7 +103,7 @@ def rasterization(
     tile_size : int
         Of the meta's lists, pixels; images are the same.
     covars : ndarray of shape (N, 3, 3), optional
-        Covariances in place of `quats` and `scales`, which are not read and may be None; of a matrix the upper triangle
+        Covariances instead of `quats` and `scales`, which are not read and may be None; of a matrix the upper triangle
         is read.
     backend : {"cpu", "cpu-exact", "reference", "cuda"} or Backend
         Implementation of the stages.
@@ -128,8 +128,8 @@ def rasterization(
     Raises
     ------
     InputError
-        If an argument has a wrong shape, dtype or value, or asks for what is not computed. No Gaussians, or none in
-        sight, is no error.
+        If an argument has a wrong shape, dtype or value, or requests something that is not computed. No Gaussians, or
+        none in sight, is no error.
     """
     check_refused("rasterization", others)
     conventions = check.choose_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
@@ -191,9 +191,8 @@ def rasterization_vjp(
     -------
     dict of ndarray
         ``v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmats`` in the shapes of the arguments, summed over
-        the cameras; ``v_backgrounds`` where there are backgrounds, ``v_covars`` in place of ``v_quats`` and
-        ``v_scales`` where there are covariances. The last row of ``v_viewmats`` is 0, and so is the lower triangle of
-        ``v_covars``.
+        the cameras; ``v_backgrounds`` where there are backgrounds, ``v_covars`` instead of ``v_quats`` and ``v_scales``
+        where there are covariances. The last row of ``v_viewmats`` is 0, and so is the lower triangle of ``v_covars``.
     """
     check_refused("rasterization_vjp", others)
     conventions = check.choose_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
@@ -282,7 +281,7 @@ class Meta(Mapping[str, Any]):
         make = self._make_tile_lists
         if key in TILE_LISTS and make is not None:
             self._values.update(make())
-            self._make_tile_lists = None  # frees what they were made of
+            self._make_tile_lists = None  # frees the arrays that they were made of
         return self._values[key]
 
     def __contains__(self, key: object) -> bool:
@@ -386,7 +385,7 @@ def covariances_vjp(covars: Floats, tape: SplatTape, v_projection: ProjectionGra
         B = A Sigma A^T + eps I,  Q = B^-1:  v_Sigma = A^T (v_rho's share - Q V_Q Q) A
 
     That of the factors, which the backend returns, does not determine it where two of the scales are equal. An entry
-    above the diagonal stands for both, so it gets the derivatives of both.
+    above the diagonal represents both, so it gets the derivatives of both.
 
     Parameters
     ----------

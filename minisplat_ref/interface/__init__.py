@@ -1,4 +1,4 @@
-"""What the program shows to a person and asks of one: used by all wings, and without any formula.
+"""The user interface that all wings share: arguments, progress, tables and pictures, without any formula.
 
 ================== ==================================================================
 :mod:`.arguments`  the types of arguments, their errors and their help

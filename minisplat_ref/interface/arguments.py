@@ -1,4 +1,4 @@
-"""What the commands' arguments share: the look of help and errors, and the types of values."""
+"""Types of the commands' arguments, and the format of help and errors."""
 
 import argparse
 import difflib
@@ -24,16 +24,16 @@ SYNTHETIC_SCENES = (  # datasets.synthetic.SCENE_NAMES, which would load NumPy
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, like those of bad input, and say what was probably meant.
+    """An argument parser whose errors are one line, like those of bad input, and suggest what was probably meant.
 
-    Options are not abbreviated: a script that says ``--iter`` would break when another option begins with that.
+    Options are not abbreviated: a script with ``--iter`` would break when another option begins with that.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{"allow_abbrev": False, **kwargs})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Parse, and refuse what is left over here, where the command's own options are known."""
+        """Parse, and refuse unknown arguments here, where the command's own options are known."""
         parsed, surplus = super().parse_known_args(args, namespace)
         if surplus:
             options = [option for action in self._actions for option in action.option_strings]
@@ -144,7 +144,7 @@ def color(text: str) -> list[float]:
 
 
 def option_name(name: str) -> str:
-    """Return how a setting is called on the command line."""
+    """Return the name of a setting on the command line."""
     return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"
 
 

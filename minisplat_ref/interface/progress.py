@@ -16,13 +16,13 @@ LOG_SECONDS = 30.0  # in a log, before the first line and between two
 
 
 class Bar(Protocol):
-    """What a step does with its bar."""
+    """The methods of a bar that a step calls."""
 
     def update(self, n: float = 1, /) -> Any:
         """Count ``n`` things as done."""
 
     def set_description(self, desc: str) -> None:
-        """Say what is being done now."""
+        """Set the description of the current work."""
 
     def __enter__(self) -> Self:
         """Return the bar."""
@@ -35,7 +35,7 @@ class Lines:
     """A file for a bar of tqdm where stderr is a log: each state that it shows becomes a line."""
 
     def write(self, text: str) -> None:
-        """Write a line without what moves a cursor."""
+        """Write a line without characters that move a cursor."""
         if shown := text.strip():
             print(f"minisplat-ref: {shown}", file=sys.stderr)
 
@@ -61,11 +61,11 @@ class _Log:
             print(f"minisplat-ref: {self._line(now - self._start)}", file=sys.stderr, flush=True)
 
     def set_description(self, desc: str) -> None:
-        """Say what is being done now."""
+        """Set the description of the current work."""
         self._description = desc
 
     def _line(self, seconds: float) -> str:
-        """Return what has been done, in which time, and how long the rest takes at that rate."""
+        """Return the work done, the time that it took, and the time that the rest takes at that rate."""
         total = "" if self._total is None else f" of {self._number(self._total)}"
         line = f"{self._description}: {self._number(self._n)}{total}{self._unit}, {_interval(seconds)} gone"
         if self._total is None or not 0 < self._n < self._total:
@@ -90,7 +90,7 @@ def _interval(seconds: float) -> str:
 
 
 def progress_bar(description: str, unit: str = "", total: float | None = None, *, delay: float = SILENT_SECONDS) -> Bar:
-    """Return the bar of a step that says itself how far it is; a context manager.
+    """Return the bar of a step that reports its progress itself; a context manager.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ def markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]], *, is_
 
 
 def machine() -> dict[str, str | int]:
-    """Return what timings depend on: processor, threads, and versions of the numerical packages."""
+    """Return everything that timings depend on: processor, threads, and versions of the numerical packages."""
     import numba
     import numpy as np
 

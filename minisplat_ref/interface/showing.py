@@ -1,4 +1,4 @@
-"""How bundles show themselves: one line in a terminal, a picture in a notebook.
+"""Representations of bundles: one line in a terminal, an image in a notebook.
 
 A NamedTuple of arrays would print every number of them. A bundle that takes its ``__repr__`` from here prints the shape
 and the dtype of each; one with ``_repr_png_``, which notebooks look for, is shown as its image.

@@ -60,7 +60,7 @@ def load_scene(
     Raises
     ------
     InputError
-        If there is nothing that can be loaded, or what is there cannot.
+        If there is nothing to load, or it cannot be loaded.
     """
     listing = list_scene(Path(path), test_every, model, offset)
     reading = build_reading(downscale, background, undistort, listing.alpha_is_mask, as_photographed)
@@ -68,7 +68,7 @@ def load_scene(
 
 
 def list_scene(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:
-    """Return what :func:`load_scene` reads besides the photographs; arguments and errors are the same."""
+    """Return everything that :func:`load_scene` reads but the photographs; arguments and errors are the same."""
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
     if find_model(path, model) is not None:

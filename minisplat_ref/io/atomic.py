@@ -53,7 +53,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def unwritable(path: str | Path, error: OSError) -> InputError:
-    """Return the error that says in one line that a file cannot be written."""
+    """Return the error of one line for a file that cannot be written."""
     return InputError(f"{path} cannot be written ({error.strerror or error}): make room there or choose another place")
 
 

@@ -26,7 +26,7 @@ _HEADER = "header"
 
 
 class DamagedCheckpoint(InputError):
-    """The file is missing, cannot be read, or is not what was written; an older one may still be intact."""
+    """The file is missing, cannot be read, or was changed; an older one may still be intact."""
 
 
 def save_checkpoint(
@@ -82,7 +82,7 @@ def _digest(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> 
 
 
 def load_checkpoint(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Read what :func:`save_checkpoint` wrote.
+    """Read a file of :func:`save_checkpoint`.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str
     """
     arrays, header = _read(path)
     metadata = header["metadata"]
-    if "sha256" in header and header["sha256"] != _digest(arrays, metadata):  # older files do not say
+    if "sha256" in header and header["sha256"] != _digest(arrays, metadata):  # older files do not have it
         raise DamagedCheckpoint(f"{path} is damaged, its content does not have the hash that it names; {WAY_OUT}")
     return arrays, metadata
 

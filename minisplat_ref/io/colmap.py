@@ -2,8 +2,8 @@
 
 Poses follow COLMAP's convention, which is also ours: cam_from_world, OpenCV axes, the centre of the top-left pixel at
 (0.5, 0.5). Masks are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) or at
-``masks/<name>.png``. An alpha channel is a mask too. A point's track says which views see it. Left out: 2D features,
-and images that COLMAP could not register.
+``masks/<name>.png``. An alpha channel is a mask too. A point's track lists the views that see it. Left out: 2D
+features, and images that COLMAP could not register.
 """
 
 import re
@@ -47,7 +47,7 @@ BINARY_RECORDS = {
     "points3D.bin": Records(n_fixed=43, has_name=False, count_format="<Q", n_item=8),
     "frames.bin": Records(n_fixed=64, has_name=False, count_format="<I", n_item=16),
 }
-# What pycolmap raises for damaged files: from its own checks, and when it takes garbage for an id or a count.
+# Errors of pycolmap for damaged files: from its own checks, and when it takes garbage for an id or a count.
 DAMAGE_ERRORS = (ValueError, IndexError, RuntimeError, MemoryError, OSError)
 
 
@@ -95,7 +95,7 @@ def load_colmap(
 
 
 def list_colmap(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:
-    """Return what :func:`load_colmap` reads besides the photographs; ``offset`` as for :func:`split_photos`."""
+    """Return all that :func:`load_colmap` reads but the photographs; ``offset`` as for :func:`split_photos`."""
     reconstruction = read_model(path, model)
     train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every, offset)
     points, colors = _points(reconstruction)
@@ -277,7 +277,7 @@ def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
 
 
 def _points_beside(path: Path, model: Path | None) -> tuple[Floats, NDArray[np.uint8]]:
-    """Return the points of the PLY that some programs leave in the place of the model's own; none without one."""
+    """Return the points of the PLY that some programs write instead of the model's own; none without one."""
     file = None if model is None else model / POINTS_PLY
     cloud: PointCloud = NO_POINTS if file is None or not file.is_file() else load_points(file)
     if not len(cloud.points):

@@ -1,6 +1,6 @@
-"""COLMAP models that pycolmap does not read as they are: byte order marks, names with spaces, no sparse points.
+"""COLMAP models that pycolmap cannot read unchanged: byte order marks, names with spaces, no sparse points.
 
-The files are copied without what is in the way, which pycolmap then reads; the names come from here.
+The files are copied without these parts, and pycolmap reads the copies; the names come from here.
 """
 
 import codecs

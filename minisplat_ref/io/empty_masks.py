@@ -1,7 +1,7 @@
 """Views whose mask leaves no pixel: found when a scene is loaded, and set aside.
 
 Such a view teaches nothing and cannot be measured. Usually its mask is of values that hardly differ from black: 0 and 1
-instead of 0 and 255, labels of classes, 8 bits in a file of 16. What a file holds is therefore said in the message.
+instead of 0 and 255, labels of classes, 8 bits in a file of 16. The message therefore describes the file's content.
 """
 
 import warnings
@@ -21,7 +21,7 @@ TRAIN_VIEWS_MIN = 2  # from which a scene can be trained
 
 
 class MaskFiles(NamedTuple):
-    """Where the mask of a view comes from."""
+    """The files that the mask of a view comes from."""
 
     image: Path
     """The photograph, whose alpha channel may be a mask."""
@@ -85,7 +85,7 @@ def report_empty(
 
 
 def _reason(view: View, files: MaskFiles) -> str:
-    """Name the file, and say why nothing of it counts."""
+    """Name the file, and explain why none of its pixels count."""
     if files.mask is None:
         return f"{files.image} (transparent everywhere)"
     if not read_mask(files.mask).any():

@@ -21,15 +21,15 @@ from minisplat_ref.io.json_file import as_array, as_number
 from minisplat_ref.types import FILE_FRAME, Camera, Floats, Frame, Scene
 
 EXTENT_MIN, EXTENT_MAX = 0.5, 1e4  # world units of ordinary scenes: 50 or 2.5 times the near planes, at least
-EXTENT = 4.0  # what others are scaled to, within a factor of the square root of 2
+EXTENT = 4.0  # others are scaled to these, within a factor of the square root of 2
 # Extents from the origin to the cameras, in ordinary scenes. float32 has 24 bits: at 100 extents it resolves 6e-6 of
 # an extent, a hundredth of a pixel of a photograph of 1,000.
 DISTANCE_MAX = 100.0
-SPREAD_MIN = 0.1  # like EXTENT_MIN, for Gaussians without a scene: whoever gives them knows the near plane
+SPREAD_MIN = 0.1  # like EXTENT_MIN, for Gaussians without a scene: their author knows the near plane
 
 
 class Unit(Enum):
-    """How the numbers of an array change with the frame."""
+    """Transformation of an array's numbers with the frame."""
 
     PLACE = "coordinates"
     LENGTH = "lengths"
@@ -202,7 +202,7 @@ def frame_to_json(frame: Frame) -> dict[str, Any]:
 
 
 def frame_from_json(value: Any) -> Frame | None:
-    """Return what :func:`frame_to_json` wrote, :data:`FILE_FRAME` for None; None if it is no frame."""
+    """Return the frame that :func:`frame_to_json` wrote, :data:`FILE_FRAME` for None; None if it is no frame."""
     if value is None:
         return FILE_FRAME
     entries = value if isinstance(value, dict) else {}

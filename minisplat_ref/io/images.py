@@ -36,7 +36,7 @@ HEIF_SUFFIXES = (".heic", ".heif")
 """Photographs of telephones, which pillow-heif reads, the extra ``heic``."""
 
 BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)
-"""Files and folders that are hidden, or that programs put beside photographs."""
+"""Names of hidden files and folders, and of those that programs put beside photographs."""
 
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"quality": 95}}
 SOURCE = "minisplat_ref source"  # key of an opened image's path among its data, for messages on its values
@@ -45,7 +45,7 @@ HALF_LEVEL = 0.5 / 255.0  # by which a float may be outside 0 to 1: it rounds to
 PIXELS_MAX = 2**29  # per image: more than cameras have, and 1.6 GB in memory
 PLAUSIBLE_PIXELS = 100_000_000  # up to this size, an image may be compressed into any number of bytes
 PIXELS_PER_BYTE = 10_000  # limit for larger ones: a white 1-bit PNG has 8256 pixels per byte
-DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
+DAMAGE_ERRORS = (  # errors of Pillow's decoders for damaged files
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
     *(RuntimeError, struct.error, zlib.error),
 )
@@ -150,7 +150,7 @@ def white_of(image: Image.Image) -> float:
     Raises
     ------
     InputError
-        The file does not say: integers of 32 bits have no agreed range.
+        The value of white is undefined: integers of 32 bits have no agreed range.
     """
     if image.mode == "F":
         return 1.0
@@ -182,7 +182,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     Raises
     ------
     InputError
-        If the file is missing, is not an image, is truncated, or does not say which value is white.
+        If the file is missing, is not an image, is truncated, or has no defined value of white.
     """
     with open_image(Path(path)) as image:
         return pixels_of(image)

@@ -1,16 +1,16 @@
-"""What a file of Gaussians says about how it is drawn: its label.
+"""The label of a file of Gaussians: the extension that renders it, and the parts of its run that it lacks.
 
-The numbers of a file do not tell which renderer they were trained for: 3DGS draws traced, filtered or integrated
-Gaussians without complaint, and worse. Nor does a file hold what every view shows besides Gaussians, such as a sky. So
-a file names the extension that draws it, and what it lacks of its run:
+The numbers of a file do not tell which renderer they were trained for: 3DGS renders traced, filtered or integrated
+Gaussians without complaint, and worse. Nor does a file hold parts other than Gaussians that every view shows, such as a
+sky. So a file names the extension that renders it, and what it lacks of its run:
 
 - a PLY in comments of its header: ``comment minisplat_ref extension NAME``, ``comment minisplat_ref set NAME=VALUE``
   for a setting of its renderer, and ``comment minisplat_ref lacks PART``;
 - a compact format of ours in its own header (:class:`minisplat_ref.io.formats.Format`);
 - a compact format of others in a sidecar, ``FILE.json``, an object with the key ``minisplat_ref``. It has the SHA-256
-  of its file, so that it does not speak for another one that is put in its place.
+  of its file, so that it does not apply to another one that replaces it.
 
-Other programs pass over all three. What 3DGS draws, and lacks nothing, has no label: it is for every program as it is.
+Other programs ignore all three. A file that 3DGS renders and that lacks nothing has no label: any program can use it.
 """
 
 import hashlib
@@ -32,18 +32,18 @@ WAY_OUT = "write the file again with minisplat-ref convert"
 
 
 class Label(NamedTuple):
-    """How a file is drawn."""
+    """The renderer of a file."""
 
     extension: str | None = None
-    """Name of the extension that draws it; None for 3DGS."""
+    """Name of the extension that renders it; None for 3DGS."""
     lacks: tuple[str, ...] = ()
-    """Names of the shared parameters that its run is drawn with, and that the file does not hold."""
+    """Names of the shared parameters that its run is rendered with, and that the file does not hold."""
     set: tuple[str, ...] = ()
     """Settings of the extension's renderer, each as ``NAME=VALUE``, that are not its own."""
 
 
 NO_LABEL = Label()
-"""That of a file which any program draws as it is."""
+"""The label of a file that any program can render."""
 
 
 def to_comments(label: Label) -> list[str]:
@@ -104,14 +104,14 @@ def from_json(value: Any, source: str | Path) -> Label:
 
 
 def warn_of_another(path: Path, label: Label, extension: str, why: str) -> None:
-    """Warn if a file says that another extension draws it than the one that is about to; ``why`` is who wants that."""
+    """Warn if a file is labelled with another extension than the one that renders it now; ``why`` names its origin."""
     if label.extension not in (None, extension):
         message = f"{path} says that extension {label.extension} draws it: {why} draws it otherwise"
         warnings.warn(one_line(message), InputWarning, stacklevel=3)
 
 
 def sidecar_of(path: Path) -> Path:
-    """Return where the label of a file is that has no place for it."""
+    """Return the path of the label of a file that has no place for it."""
     return path.with_name(f"{path.name}.json")
 
 
@@ -145,7 +145,7 @@ def read_sidecar(path: Path, content: bytes) -> Label:
 
 
 def write_sidecar(path: Path, content: bytes, label: Label) -> None:
-    """Write the label beside a file that will have this content; without a label, remove that of an earlier file.
+    """Write the label beside a file that will have this content, or remove that of an earlier file.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Lens distortion: most renderers have only pinhole cameras, so pycolmap warps other photographs to a pinhole.
 
-COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels. For renderers that draw
-what the lens has drawn, :func:`optics_of` says what it does in the terms of :class:`minisplat_ref.types.Optics`.
+COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels. For renderers that
+support the lens, :func:`optics_of` describes it as :class:`minisplat_ref.types.Optics`.
 """
 
 from collections.abc import Mapping
@@ -46,7 +46,7 @@ N_COEFFICIENTS = {BROWN: 8, FISHEYE: 4, "orthographic": 0}
 
 
 def optics_of(lens: Lens, path: Path) -> Optics:
-    """Return what a lens of COLMAP does to directions; ``path`` is the photograph's, for the message.
+    """Return the optics of a lens of COLMAP; ``path`` is the photograph's, for the message.
 
     Raises
     ------

@@ -70,7 +70,7 @@ def read_npz(path: str | Path, way_out: str, names: Collection[str] | None = Non
         raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); {way_out}") from error
-    except Exception as error:  # what zipfile and the decoders raise for damaged bytes is a dozen types
+    except Exception as error:  # zipfile and the decoders raise a dozen types of errors for damaged bytes
         raise InputError(f"{path} is not an .npz of plain arrays, or is damaged ({error}); {way_out}") from error
 
 

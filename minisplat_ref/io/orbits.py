@@ -3,8 +3,8 @@
 A camera is described in the cylinder about the scene's axis, which is at right angles to the horizontal edges of the
 images and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius,
 height and viewing direction of the training cameras near that angle, so that it stays where the scene was photographed:
-beyond, nothing has taught the Gaussians what to show. Where more than a quarter of the circle was never photographed,
-the path leaves it out, and goes there and back along the rest.
+beyond, no photograph has constrained the Gaussians. Where more than a quarter of the circle was never photographed, the
+path leaves it out, and goes there and back along the rest.
 """
 
 import math
@@ -22,7 +22,7 @@ FULL_CIRCLE = 2.0 * math.pi
 LARGEST_GAP = math.radians(90.0)  # between neighbouring cameras; a larger one is not crossed
 SMOOTHING = math.radians(15.0)  # standard deviation of the weights by which cameras near an angle count
 MEAN_UP_WEIGHT = 0.02  # against the spread of horizontal edges, which is 1/2 all around and 0.1 along 70 degrees
-RADIUS_MIN = 0.1  # of the median: the angle of a camera nearer to the axis says nothing
+RADIUS_MIN = 0.1  # of the median: the angle of a camera nearer to the axis is arbitrary
 PARALLEL = 0.9  # length of the mean viewing direction, from which on the axes may meet behind the cameras
 
 
@@ -43,8 +43,8 @@ def orbit(
     width, height : int
         Image size, pixels.
     arc : float, optional
-        Angle that the path covers, radians, about the middle of what was photographed. Less than a full circle is
-        travelled there and back. By default, what the training cameras cover, or the full circle.
+        Angle that the path covers, radians, centred on the middle of the training cameras. Less than a full circle is
+        travelled there and back. By default the angle that the training cameras cover, or the full circle.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def orbit(
 
 
 class _Path(NamedTuple):
-    """Cameras in the cylinder about an axis, by which the path is drawn."""
+    """Cameras in cylindrical coordinates about an axis, which define the path."""
 
     target: Floats
     """[3] origin of the cylinder, world frame."""

@@ -6,8 +6,7 @@ channel-major: all red coefficients, then all green, then all blue, whereas :cla
 are wxyz, the frame is COLMAP's (x right, y down, z forward).
 
 Files are read by property name, so order, normals and extra properties do not matter; :mod:`.ply_file` reads the bytes,
-:mod:`.ply_dialects` knows what other programs call the properties.
-Left out: compressed variants.
+:mod:`.ply_dialects` has other programs' names of the properties. Left out: compressed variants.
 """
 
 import re
@@ -141,7 +140,7 @@ def save_ply(path: str | Path, gaussians: Any, label: Label = NO_LABEL) -> None:
         Of any spherical-harmonic degree; N may be 0. A further field of shape [N] becomes a property with its name, one
         of shape [N, k] the properties ``NAME_0``, ``NAME_1``, ...; other readers skip them.
     label : Label
-        What the header says about how the file is drawn.
+        The label in the header, which names the file's renderer.
 
     Raises
     ------
@@ -171,7 +170,7 @@ def save_ply(path: str | Path, gaussians: Any, label: Label = NO_LABEL) -> None:
 
 
 def read_label(path: str | Path) -> Label:
-    """Return what a PLY says about how it is drawn.
+    """Return the label of a PLY.
 
     Raises
     ------
@@ -182,7 +181,7 @@ def read_label(path: str | Path) -> Label:
 
 
 def are_far(gaussians: Any) -> bool:
-    """Return whether centres lie so far from the origin that in float32 most would move by much of their size."""
+    """Return whether centres lie so far from the origin that float32 would move most by a large part of their size."""
     means, log_scales = gaussians.means, getattr(gaussians, "log_scales", None)
     if means.dtype != np.float64 or log_scales is None or not len(means):
         return False
@@ -225,7 +224,7 @@ NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), False, 0)
 def load_points(path: str | Path) -> PointCloud:
     """Read the points of any PLY, with their colours.
 
-    To train from them, they take the place of the scene's own points at the start, in the scene's world frame::
+    To train from them, replace the scene's own points at the start, in the scene's world frame::
 
         start = scene._replace(points=cloud.points, point_colors=cloud.colors)
         train(scene, recipe, seed=0, state=initial_state(start, recipe, seed=0))
@@ -313,7 +312,7 @@ def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[st
 
 
 def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
-    """Return what to do with a PLY that does not contain Gaussians."""
+    """Return advice for a PLY that does not contain Gaussians."""
     if "packed_position" in columns:
         return "it is SuperSplat's: let its name end in .compressed.ply"
     n_faces = n_rows_of(path, "face")

@@ -1,11 +1,11 @@
-"""PLY files of Gaussians as programs other than 3DGS write them: their columns under the names of 3DGS.
+"""PLY files of Gaussians from programs other than 3DGS: their columns under the names of 3DGS.
 
 - other names, in upper or lower case: ``scaling_0``, ``scale_x``, ``rotation_0``, ``quat_w``, ``features_dc_0``, ...;
-- colours ``red, green, blue`` in place of ``f_dc_0..2``, as nerfstudio exports them in its mode ``rgb``;
+- colours ``red, green, blue`` instead of ``f_dc_0..2``, as nerfstudio exports them in its mode ``rgb``;
 - two scales, of flat Gaussians (2DGS): the third axis becomes a thousandth of the smaller one;
 - opacities of plus or minus infinity, the logits of 1 and 0, and scales of minus infinity, the logarithm of 0.
 
-Numbers after a name are in the order of 3DGS, so ``rot_0`` is w; letters say it themselves. Values keep their meaning:
+Numbers after a name are in the order of 3DGS, so ``rot_0`` is w; letters are explicit. Values keep their meaning:
 logarithms of scales, logits of opacities.
 """
 
@@ -32,7 +32,7 @@ STEMS = {
         for stem in ("rot", "rots", "rotation", "rotations", "quat", "quats", "quaternion", "q", "orientation")
     },
 }
-"""What other programs call the properties of 3DGS, without the number or letter at the end."""
+"""Other programs' names of the properties of 3DGS, without the number or letter at the end."""
 
 LETTERS = {"": "xyz", "scale": "xyz", "rot": "wxyz"}
 """The order of the letters at the end of a name."""
@@ -41,12 +41,12 @@ NUMBERED = re.compile(r"(.*?)[_.\[(]*(\d+)[\])]?")
 LETTERED = re.compile(r"(.*?)[_.]?([wxyz])")
 DC, RGB = ("f_dc_0", "f_dc_1", "f_dc_2"), ("red", "green", "blue")
 OPACITY_LOGIT_MAX = 16.0  # of an opacity of 1 - 1e-7, the largest below 1 in float32
-LOG_SCALE_MIN = -30.0  # 1e-13 units, whose square float32 still holds
+LOG_SCALE_MIN = -30.0  # 1e-13 units; its square is still representable in float32
 FLATNESS = 1000.0  # of a Gaussian with two scales
 
 
 def usual_name(name: str) -> str:
-    """Return what 3DGS calls a property, or the name itself."""
+    """Return the name of a property in 3DGS, or the name itself."""
     folded = name.casefold().replace(" ", "_")
     if folded in ("x", "y", "z"):
         return folded
@@ -73,7 +73,7 @@ def renamed(names: Collection[str]) -> dict[str, str]:
 
 
 def as_usual(path: str | Path, columns: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Return the columns of a PLY of Gaussians as 3DGS would have written them; a warning says what was changed.
+    """Return the columns of a PLY of Gaussians as 3DGS would have written them; a warning lists the changes.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def _coefficients(path: str | Path, name: str, values: NDArray) -> NDArray[np.fl
 
 
 def _make_finite(columns: dict[str, NDArray]) -> list[str]:
-    """Replace infinities that have a meaning by the nearest number that renders; return what was replaced."""
+    """Replace infinities that have a meaning by the nearest number that renders; return a list of the replacements."""
     notes = []
     opacity = columns["opacity"]
     if (n := np.count_nonzero(np.isinf(opacity))) > 0:

@@ -20,7 +20,7 @@ def read_faces(path: str | Path) -> list[Corners]:
     Returns
     -------
     list of ndarray of shape (c,)
-        With as many corners each as the file says. Empty if it has no faces, or faces without a list of corners.
+        With the number of corners of each in the file. Empty if it has no faces, or faces without a list of corners.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def _of_bytes(file: BinaryIO, path: Path, faces: Element, corners: Property) -> 
         count = 1
         if p.count_dtype is not None:
             count = int(np.frombuffer(read_exactly(file, path, p.count_dtype.itemsize), p.count_dtype)[0])
-        if not 0 <= count <= n_bytes:  # before memory is asked for
+        if not 0 <= count <= n_bytes:  # before memory is allocated
             raise InputError(f"{path}: a list {p.name} has {count} values; export the PLY again")
         values = read_exactly(file, path, count * p.dtype.itemsize)
         if p is corners:

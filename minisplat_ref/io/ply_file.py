@@ -89,7 +89,7 @@ class Header(NamedTuple):
 
 
 def n_rows_of(path: str | Path, name: str) -> int:
-    """Return how many rows the elements of a name have together, 0 if there are none, such as ``face``.
+    """Return the total number of rows of the elements of a name, such as ``face``; 0 if there are none.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def write_vertices(
 
 
 def open_ply(path: Path) -> BinaryIO:
-    """Open a file, or raise an InputError that says why it cannot be opened."""
+    """Open a file, or raise an InputError with the reason why it cannot be opened."""
     try:
         return path.open("rb")
     except OSError as error:
@@ -252,7 +252,7 @@ def pass_over(file: BinaryIO, path: Path, element: Element) -> None:
 
 
 def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
-    """Read the declared vertices and ignore what follows them."""
+    """Read the declared vertices and ignore everything after them."""
     n, dtype = vertices.n, vertices.dtype
     if vertices.has_lists:
         return np.frombuffer(b"".join(_read_row(file, path, vertices) for _ in range(n)), dtype)

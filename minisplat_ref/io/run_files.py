@@ -1,6 +1,6 @@
-"""Files of a run that relatives read, too: their names, and where a command finds them that takes a run or a PLY.
+"""Files of a run that relatives read, too: their names, and their places for a command that takes a run or a PLY.
 
-What needs a run with its recipe and its photographs is the application, which opens it (:mod:`minisplat_ref.app.runs`).
+The application opens whole runs, with their recipe and photographs (:mod:`minisplat_ref.app.runs`).
 """
 
 from pathlib import Path
@@ -12,8 +12,8 @@ from minisplat_ref.io.viewpoints import Viewpoint
 CONFIG = "config.json"  # everything needed to run it again
 POINT_CLOUD = "point_cloud.ply"  # the Gaussians
 SHARED = "shared.npz"  # parameters that belong to no Gaussian, if there are any
-CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
-METRICS = "metrics.json"  # what was measured on the test views
+CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render and recognise them
+METRICS = "metrics.json"  # metrics of the test views
 
 
 def model_file(path: Path) -> Path:
@@ -27,7 +27,7 @@ def read_cameras(file: Path, given: Path | None = None) -> list[Viewpoint]:
     Raises
     ------
     InputError
-        There are none, or the file is not what it should be.
+        There are none, or the file is damaged.
     """
     beside = file.parent / CAMERAS
     if given is None and not beside.is_file():

@@ -1,4 +1,4 @@
-"""From photographs with cameras to a :class:`Scene`: what the COLMAP and transforms.json readers have in common.
+"""From photographs with cameras to a :class:`Scene`: the common part of the readers of COLMAP and transforms.json.
 
 Pixels are read, masked, composited, undistorted and downscaled here, and everything that makes a scene unusable is
 detected here. All photographs are kept in memory as uint8 if they take a moderate part of it; if they would take more,
@@ -85,7 +85,7 @@ class Listing(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """How photographs become views."""
+    """Options for making views of photographs."""
 
     downscale: int
     """Divide the image size by this; ``<folder>_D`` is used where it exists."""
@@ -151,7 +151,7 @@ def build_scene(listing: Listing, reading: Reading) -> Scene:
     listing : Listing
         Of at least two training photographs.
     reading : Reading
-        How photographs become views.
+        Options for making views of photographs.
 
     Returns
     -------
@@ -201,7 +201,7 @@ def build_scene(listing: Listing, reading: Reading) -> Scene:
 
 
 def _check_places(source: Path, cameras: Sequence[Camera]) -> None:
-    """Refuse training cameras that all stand at one point."""
+    """Refuse training cameras that are all at one point."""
     if camera_extent(cameras) == 0.0:
         raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
 
@@ -413,7 +413,7 @@ def _apply_alpha_and_mask(
 
 
 def _wrong_size(photo: Photo, path: Path, width: int, height: int) -> str:
-    """Return what to do about an image [height, width] whose size is not its camera's."""
+    """Return advice for an image [height, width] whose size is not its camera's."""
     camera = photo.camera
     problem = f"{path}: the image is {width}x{height} but its camera is {camera.width}x{camera.height}"
     if (height, width) == (camera.width, camera.height) and is_turned(path):

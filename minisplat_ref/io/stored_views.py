@@ -112,7 +112,7 @@ class Photograph:
 class StoredView(View):
     """A view whose image and mask are read again at every access, unless they stay in memory.
 
-    Code that needs both, or one of them twice, calls :meth:`load` once. In place of the image the tuple has a
+    Code that needs both, or one of them twice, calls :meth:`load` once. Instead of the image the tuple has a
     :class:`Photograph`.
     """
 
@@ -154,7 +154,7 @@ class StoredView(View):
 
 
 def make_room(views: Sequence[View], needed: float) -> float:
-    """Limit photographs to a share of the memory that is free once something else has what it needs.
+    """Limit photographs to a share of the memory that remains free after other needs.
 
     Parameters
     ----------

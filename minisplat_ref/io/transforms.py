@@ -9,8 +9,8 @@
 
 Poses are world_from_camera in OpenGL axes (x right, y up, z backward); flipping the y and z columns gives OpenCV axes,
 and the inverse gives cam_from_world. The world frame stays the file's. An alpha channel is composited onto the
-background. :mod:`.names` says which paths are read. Left out: ``depth_file_path``, file lists of splits, per-frame
-exposure, rolling shutter.
+background. :mod:`.names` restricts the paths that are read. Left out: ``depth_file_path``, file lists of splits,
+per-frame exposure, rolling shutter.
 """
 
 import math
@@ -80,7 +80,7 @@ def load_transforms(
 
 
 def list_transforms(path: Path, test_every: int, offset: int = 0) -> Listing:
-    """Return what :func:`load_transforms` reads besides the photographs; ``offset`` as for :func:`split_photos`."""
+    """Return all that :func:`load_transforms` reads but the photographs; ``offset`` as for :func:`split_photos`."""
     files = find_transforms(path)
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")

@@ -29,7 +29,7 @@ class Viewpoint(NamedTuple):
     camera: Camera
     """The camera."""
     split: str
-    """``train``, ``test`` or, where nothing says so, the empty string."""
+    """``train``, ``test``, or the empty string if unknown."""
     time: float = 0.0
     """The moment shown, in [0, 1]; for scenes that move."""
 

@@ -1,4 +1,4 @@
-"""The only place where jit flags, caching and threading are decided.
+"""Compilation of kernels: the only place that sets jit flags, caching and threading.
 
 ``scalar`` marks a formula of one Gaussian or one pixel: it stays a plain Python function and is inlined into the
 kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this file:
@@ -20,8 +20,8 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
 * ``fastmath=True`` would let the compiler assume that there are no NaN, and ``isnan`` return False. Kernels may only
   contract ``a * b + c`` to one rounding.
 * Code in the cache has been optimised twice, and a compiler that may reorder a sum gives other last digits the second
-  time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` says so and fixes the order. The
-  compiler may still choose which products to contract; freshly compiled and cached code have nevertheless given the
+  time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` does so explicitly and fixes the order.
+  The compiler may still choose which products to contract; freshly compiled and cached code have nevertheless given the
   same bytes wherever that was tried, and ``tests/jit/test_kernels.py`` tries it on the processor that it runs on.
 """
 

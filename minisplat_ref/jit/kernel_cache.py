@@ -26,7 +26,7 @@ class KernelFolder(NamedTuple):
     """Compiled functions, one for each combination of types."""
     n_bytes: int
     is_current: bool
-    """Whether this installation uses it now."""
+    """Whether this installation uses it."""
 
 
 def kernel_folders() -> list[KernelFolder]:

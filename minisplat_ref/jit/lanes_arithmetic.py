@@ -1,4 +1,4 @@
-"""How lanes are compiled: their type, arithmetic, and the functions that work lane by lane.
+"""Compilation of lanes: their type, arithmetic, and the functions that work lane by lane.
 
 Each Python function of :mod:`minisplat_ref.jit.lanes` gets a compiled implementation here, an LLVM instruction for a
 vector of eight. No kernel imports this file.

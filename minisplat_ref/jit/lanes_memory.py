@@ -1,4 +1,4 @@
-"""How lanes are compiled, continued: between lanes and single numbers, arrays and bits."""
+"""Compilation of lanes, continued: between lanes and single numbers, arrays and bits."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,8 +1,8 @@
 """Compile kernels ahead of their use, in several processes at once.
 
 A process compiles one function at a time, so that whatever runs first would wait for one kernel after the other. Here
-several processes compile, and whatever runs later finds the kernels on disk. What to call is the business of those who
-have kernels: :mod:`minisplat_ref.rendering.warm_up` for the stages, :mod:`minisplat_ref.extensions.warm_up` for all.
+several processes compile, and whatever runs later finds the kernels on disk. The modules that have kernels define the
+calls: :mod:`minisplat_ref.rendering.warm_up` for the stages, :mod:`minisplat_ref.extensions.warm_up` for all.
 """
 
 import gc
@@ -21,7 +21,7 @@ Dtype = type[np.floating]
 
 
 class Task(NamedTuple):
-    """What one process calls, so that kernels are compiled."""
+    """The calls of one process that compile kernels."""
 
     name: str
     """For people."""
@@ -37,7 +37,7 @@ class Compiled(NamedTuple):
     seconds: float
     """Time that it took; little where all was on disk already."""
     problem: str = ""
-    """What :attr:`Task.call` returned."""
+    """The result of :attr:`Task.call`."""
 
 
 def compile_all(

@@ -1,4 +1,4 @@
-"""Mechanisms: what two or more relatives of 3DGS are made of, built once. No mechanism imports a relative.
+"""Mechanisms: building blocks of two or more relatives of 3DGS, built once. No mechanism imports a relative.
 
 ==================  ====================================================================================
 :mod:`.rays`        rays through a tree of Gaussians of any shape, forward and backward
@@ -11,6 +11,6 @@
 :mod:`.sampling`    sampling intervals of cameras, and images at other sampling rates
 ==================  ====================================================================================
 
-The docstring of each package says what a relative must bring. When a second relative needs what the first one built, it
-moves here; a formula of the papers that the core needs, too, moves to ``reference/`` and ``scalar/`` instead.
+The docstring of each package lists what a relative must provide. When a second relative needs a part of the first one,
+the part moves here; a formula of the papers that the core needs, too, moves to ``reference/`` and ``scalar/`` instead.
 """

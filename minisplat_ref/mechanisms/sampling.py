@@ -1,7 +1,7 @@
 """Sampling intervals of cameras, and images at other samplings.
 
-At scale z an image has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, which
-is what a sensor with larger pixels would have measured.
+At scale z an image has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, as a
+sensor with larger pixels would have measured it.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.types import Camera, Floats, Scene
 
 MARGIN = 0.15  # fraction of the image's size by which a centre may lie outside and still count as seen
-NEAR = 0.2  # world units: a camera does not see what is nearer than that
+NEAR = 0.2  # world units: a camera does not see points nearer than this
 
 
 def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:

@@ -1,4 +1,4 @@
-"""The methods, one file per paper: the actions of the method, and its recipe, which says when they act.
+"""The methods, one file per paper: the actions of the method, and the recipe with their schedule.
 
 A recipe is data (:mod:`minisplat_ref.training.schedule`), written for its published number of iterations.
 """

@@ -1,4 +1,4 @@
-"""3DGS (Kerbl et al. 2023): its density control and opacity reset as actions, and when each of them acts.
+"""3DGS (Kerbl et al. 2023): its density control and opacity reset as actions, and their schedule.
 
 The mathematics is in :mod:`minisplat_ref.strategy.clone_split`; an action takes its arguments from the training state
 and stores the result there. ``3dgs`` is the method as released, ``3dgs-accel`` the same with the authors' later

@@ -1,7 +1,7 @@
 """Mini-Splatting (Fang and Wang 2024): densify by blur split and depth, then keep few Gaussians, chosen by importance.
 
 As released, without opacity resets. Where the released code has constants for photographs of a megapixel, ours depend
-on the scene: as many points are drawn as there were Gaussians, and a blurred Gaussian covers at least a few pixels.
+on the scene: as many points are sampled as there were Gaussians, and a blurred Gaussian covers at least a few pixels.
 ``docs/FIDELITY.md`` lists each difference.
 """
 
@@ -152,8 +152,8 @@ def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
 def limit_sizes(gaussians: Gaussians, scene: Scene, size_fraction: float) -> Gaussians:
     """Return Gaussians that are no larger than :func:`size_limits`.
 
-    What starts again is as large as the distance to its neighbours. Few points far behind the scene are as far from
-    each other as from the cameras, and would veil the views.
+    A Gaussian that is started again is as large as the distance to its neighbours. Few points far behind the scene are
+    as far from each other as from the cameras, and would veil the views.
     """
     limits = np.log(size_limits(gaussians.means, scene, size_fraction)).astype(gaussians.log_scales.dtype)
     return gaussians._replace(log_scales=np.minimum(gaussians.log_scales, limits[:, None]))

@@ -38,7 +38,7 @@ from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
 from minisplat_ref.types import Bools
 
-HALF_SIDE_MIN = 100  # pixels; so small a photograph shows little of what the whole one does
+HALF_SIDE_MIN = 100  # pixels; a photograph smaller than this has lost most of its details
 COLLECTED = ("gradient_sum", "view_count", "is_blurred")
 
 

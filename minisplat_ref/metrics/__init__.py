@@ -1,4 +1,4 @@
-"""Metrics: how close renders are to photographs, by PSNR, SSIM and LPIPS.
+"""Metrics: PSNR, SSIM and LPIPS of renders against photographs.
 
 :mod:`.evaluation` has the metrics of images and of a set of views, :mod:`.lpips` the perceptual distance.
 """

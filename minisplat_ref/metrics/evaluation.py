@@ -1,13 +1,13 @@
-"""How close renderings are to photographs: PSNR, SSIM, LPIPS, and the evaluation of a set of views.
+"""PSNR, SSIM and LPIPS of renderings against photographs, and the evaluation of a set of views.
 
 Renderings are clipped to [0, 1] but not rounded to 8 bits, which would add 1.3e-6 to the mean squared error: 0.006 dB
 at 30 dB. PSNR is computed from the mean squared error over all pixels and channels of an image; the released 3DGS
 script averages the PSNR of the channels instead, which is never lower. Means over views are means of the views' values.
 
-Nothing says what exposure and white balance a held-out photograph had. So its PSNR is given twice: as rendered, and
+The exposure and white balance of a held-out photograph are unknown. So its PSNR is given twice: as rendered, and
 after the affine map of the colours that brings the rendering closest to the photograph (:func:`correct_colors`).
 
-LPIPS needs the weights of a network, which are not ours to ship; without them an :class:`Evaluation` says so.
+LPIPS needs the weights of a network, which are not ours to ship; an :class:`Evaluation` without them has a note of it.
 """
 
 import math
@@ -52,10 +52,10 @@ class Evaluation(NamedTuple):
     lpips: float | None
     """Mean of the views; None when it was not measured."""
     lpips_reason: str | None
-    """Why it was not measured."""
+    """The reason why it was not measured."""
     per_view: list[ViewMetrics]
     lpips_network: str | None = None
-    """VGG16 or AlexNet, whose distances cannot be compared with each other; None when LPIPS was not measured."""
+    """VGG16 or AlexNet, with distances that cannot be compared with each other; None when LPIPS was not measured."""
     psnr_corrected: float | None = None
     """dB after :func:`correct_colors`, mean of the views; None without views."""
 

@@ -1,4 +1,4 @@
-"""LPIPS: how different two images look to a network that was trained to recognise objects (Zhang et al., CVPR 2018).
+"""LPIPS: the distance of two images in the features of a network for recognising objects (Zhang et al., CVPR 2018).
 
 Equation (1) of the paper, for images x and x0, layers l and pixels h, w of a layer::
 
@@ -10,7 +10,7 @@ pixel over the squared differences. Equal images have distance 0.
 
 The network takes colours from -1 to 1, and first shifts and scales each channel. **The evaluation released with 3DGS
 gives other figures**: it shifts and scales colours from 0 to 1 by the same numbers. gsplat's example trainer follows it
-with VGG16, on purpose, but not with AlexNet. :func:`lpips` maps [0, 1] to [-1, 1] first, as the authors say; for
+with VGG16, on purpose, but not with AlexNet. :func:`lpips` maps [0, 1] to [-1, 1] first, as its authors recommend; for
 3DGS's figure, call it with ``(1 + image) / 2`` and ``(1 + target) / 2``, of images rounded to 8 bits.
 
 The user provides the weights: a file of the state dict of the package ``lpips``, which :data:`HOW_TO_MAKE` makes. The
@@ -179,12 +179,12 @@ def _read_arrays(path: str | Path) -> dict[str, NDArray]:
 
 
 def _wrong(arrays: Mapping[str, NDArray], name: str) -> str:
-    """Return what is wrong with an array."""
+    """Return the error of an array."""
     return f"{name} is {arrays[name].dtype} of shape {arrays[name].shape}" if name in arrays else f"{name} is missing"
 
 
 def check_views(network: Network, views: Sequence[View]) -> None:
-    """Refuse views that are too small for the network, whose last layers would be left without pixels.
+    """Refuse views that are too small for the network: its last layers would have no pixels.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The oracle: what a backend is checked against, and how.
+"""The oracle: everything that a backend is checked against, and the checks.
 
 Each check answers one question, and ``minisplat-ref oracle`` runs it. Read them in this order:
 
@@ -16,12 +16,12 @@ module           content                                                        
 ``gradients``    are the gradients derivatives?                                                ``gradients``
 ``planted``      would an error be found? Backends that are wrong in one formula, on purpose   ``compare``
 ``truth``        is float64 enough? The formulas in 50 digits                                  ``truth``
-``hard_cases``   what breaks renderers, as data; every precision against the reference         ``hard-cases``
+``hard_cases``   scenes that break renderers; every precision against the reference            ``hard-cases``
 ``golden``       arrays of every stage, for authors of other renderers                         ``export``
-``renderer``     what can be compared: a name, a precision and arrays for a scene
+``renderer``     another renderer: a name, a precision and arrays for a scene
 ``comparison``   where does another renderer differ, and does it matter?                       ``compare``
 ``peers``        other renderers: gsplat in PyTorch and in CUDA, the 3DGS rasteriser           ``compare``
 ===============  ============================================================================  =============
 
-This package is about correctness only; for speed, and what it costs in digits, see :mod:`minisplat_ref.bench`.
+This package is about correctness only; for speed, and its cost in digits, see :mod:`minisplat_ref.bench`.
 """

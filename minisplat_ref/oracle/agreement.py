@@ -1,6 +1,6 @@
-"""Whether the backends draw the same: each stage of a model on the same input, against the first backend.
+"""Agreement of backends: each stage of a model on the same input, compared with the first backend.
 
-Gradients are checked against differences of the very backend that computes them, so what is wrong in both, such as an
+Gradients are checked against differences of the very backend that computes them, so an error in both, such as a wrong
 order of Gaussians, passes there. It does not pass here, unless all backends are wrong in the same way.
 """
 
@@ -22,7 +22,7 @@ def agreement_cases(
     representation: Representation | None,
     stages: Stages | None,
 ) -> list[list[Case]]:
-    """Compare what every stage computes on each backend with what it computes on the first one.
+    """Compare the results of every stage on each backend with those on the first one.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Compare another renderer's version of a call of gsplat's with ours in float64: the first stage that differs is named.
 
-A :class:`Call` says what is called, which arrays are compared, and which errors can be planted. A renderer is anything
-that returns, for a scene, arrays by name: the meta of the call, its images, and gradients. Stages that depend on others
-come after them, so that the first that differs is where to look: a wrong conic makes a wrong alpha, and that makes
-everything else wrong.
+A :class:`Call` defines what is called, which arrays are compared, and which errors can be planted. A renderer is
+anything that returns, for a scene, arrays by name: the meta of the call, its images, and gradients. Stages that depend
+on others come after them, so that the first that differs is where to look: a wrong conic makes a wrong alpha, and that
+makes everything else wrong.
 """
 
 import functools
@@ -27,11 +27,11 @@ POSE = "viewmats"
 
 
 class CallScene(NamedTuple):
-    """The arguments of one call, and what its images are differentiated along."""
+    """The arguments of one call, and the cotangents of its images."""
 
     name: str
     what: str
-    """One line: what it is for."""
+    """One line: its purpose."""
     arguments: dict[str, Any]
     """Of the call: arrays in float64, and settings."""
     cotangents: dict[str, Floats]
@@ -46,9 +46,9 @@ class StageArray(NamedTuple):
     what: str
     """Shape and meaning, for the README of golden vectors."""
     part: Callable[[np.ndarray], np.ndarray] = np.asarray
-    """Returns what of it is compared."""
+    """Returns the part of it that is compared."""
     is_of_rows: bool = False
-    """Whether rows of Gaussians are compared only where ours has a value: not where culled, which nobody reads."""
+    """Whether rows of Gaussians are compared only where ours has a value; culled rows are never read."""
 
 
 class PlantedInCall(NamedTuple):
@@ -56,7 +56,7 @@ class PlantedInCall(NamedTuple):
 
     what: str
     stage: str
-    """Where it has to be found: the name of a stage."""
+    """The name of the stage in which it has to be found."""
     plant: Callable[[Any], Any]
     """Turns the steps of the call into wrong ones."""
 
@@ -67,7 +67,7 @@ class Call(NamedTuple):
     name: str
     """That ``--call`` takes."""
     subject: str
-    """What it renders, for messages."""
+    """The primitive that it renders, for messages."""
     images: tuple[str, ...]
     """Names of its results before the meta."""
     stages: Mapping[str, StageArray]
@@ -143,10 +143,10 @@ def choose_renderer(call: Call, name: str, dtype: str | None = None, arrays: str
         ``cpu``, ``cpu-exact``, ``reference``, ``planted:ERROR``, ``gsplat-torch``, ``package.module:function``, or a
         folder of arrays.
     dtype : str, optional
-        ``"float32"`` or ``"float64"``: what is computed in. By default float64 for ours and gsplat's torch functions,
-        float32 for the others.
+        ``"float32"`` or ``"float64"``, the dtype of the computation. By default float64 for ours and gsplat's torch
+        functions, float32 for the others.
     arrays : str, optional
-        ``"numpy"`` or ``"torch"``: what a function is called with; by default what its module imports.
+        ``"numpy"`` or ``"torch"``, the kind of a function's arguments; by default the one that its module imports.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def compare(call: Call, renderer: CallRenderer, scenes: Mapping[str, tuple[CallS
 
 
 def _is_given(ours: np.ndarray, radii: np.ndarray, other_radii: Any) -> np.ndarray:
-    """Return which rows of an array count: what is culled nobody reads, and who culls what is compared by itself."""
+    """Return the rows to compare: culled rows are excluded, and culling is compared separately."""
     axes = tuple(range(2, ours.ndim))
     is_given = (radii[..., 0] > 0) & np.any(ours != 0, axis=axes)
     if np.shape(other_radii) == radii.shape:
@@ -289,7 +289,7 @@ def _unpacked(function: Callable[..., Any]) -> Callable[..., Any]:
     """Switch off gsplat's packed projection, in which the meta has other rows and no camera is distorted."""
     try:
         has_it = "packed" in inspect.signature(function).parameters
-    except (TypeError, ValueError):  # compiled code may not tell
+    except (TypeError, ValueError):  # compiled code may have no signature
         has_it = False
     return functools.partial(function, packed=False) if has_it else function
 

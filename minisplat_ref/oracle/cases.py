@@ -19,22 +19,22 @@ class Case(NamedTuple):
     name: str
     """Unique in its report."""
     passed: bool
-    """Whether the result is as it should be."""
+    """Whether the result is correct."""
     figures: dict[str, Figure]
     """Measured values by the heading of their column."""
     note: str = ""
-    """Why it failed, or what else a reader must know; one line."""
+    """The reason of a failure, or another note for the reader; one line."""
 
 
 class Report(NamedTuple):
     """The cases of one command."""
 
     title: str
-    """What was checked, one line."""
+    """The subject of the check, one line."""
     cases: tuple[Case, ...]
     """In the order in which they are read."""
     settings: dict[str, Any]
-    """What the figures depend on."""
+    """The conditions on which the figures depend."""
 
     @property
     def n_failed(self) -> int:
@@ -92,7 +92,7 @@ def save_json(report: Report, path: str | Path) -> None:
 
 
 def verdict(reports: Sequence[Report]) -> str:
-    """Return the closing line: how many of the cases passed."""
+    """Return the closing line: the number of cases that passed."""
     n, n_failed = sum(len(report.cases) for report in reports), sum(report.n_failed for report in reports)
     return f"all {n} cases passed" if n_failed == 0 else f"{n_failed} of {n} cases failed"
 

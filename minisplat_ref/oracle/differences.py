@@ -34,7 +34,7 @@ ROUNDINGS = 30.0
 
 
 class Point(NamedTuple):
-    """What a function under test returns."""
+    """The result of a function under test."""
 
     outputs: tuple[Floats, ...]
     sides: tuple[np.ndarray, ...] = ()
@@ -111,7 +111,7 @@ class InnerProduct(NamedTuple):
 
     input: str
     size: float
-    """Sum of the sizes of its terms, so that a direction that happens to cancel is not judged by what it leaves."""
+    """Sum of the sizes of its terms, so that a direction that happens to cancel is not judged by the remainder."""
     error: float
     """Difference between the two sides, relative to ``size``."""
     step: float
@@ -190,9 +190,9 @@ def settled_derivative(
 ) -> tuple[tuple[Floats, ...], float]:
     """Return :func:`derivative` with the first of ``steps`` that the next smaller one confirms, and that step.
 
-    For functions that do not tell on which side of their thresholds they are: a kink or a jump inside the stencil
+    For functions that do not report the sides of their thresholds: a kink or a jump inside the stencil
     changes the two estimates by different amounts. They agree if they differ by less than ``SETTLED`` of the larger, or
-    by what rounding explains.
+    by the rounding error.
     """
     size = max(float(np.max(np.abs(output), initial=0)) for output in function(*inputs).outputs)
     estimates = [derivative(function, inputs, index, direction, steps[0])]
@@ -244,7 +244,7 @@ def check_jacobians(
     steps : sequence of float
         As for :func:`careful_derivative`.
     differentiate : callable
-        :func:`careful_derivative`, or :func:`settled_derivative` for a function that does not tell its thresholds.
+        :func:`careful_derivative`, or :func:`settled_derivative` for a function that does not report its thresholds.
 
     Returns
     -------

@@ -1,6 +1,6 @@
 """The gradient proof: check each stage of a backend with full Jacobians, inner products and automatic differentiation.
 
-Besides the stages it checks the public call ``rasterization`` in every mode, with what it adds to the stages.
+Besides the stages it checks the public call ``rasterization`` in every mode, with what that adds to the stages.
 
 Full Jacobians on a tiny scene cover every entry of every gradient, including those that cancel along a random
 direction; inner products on a larger scene cover many tiles and long lists. A check that cannot fail counts as failed:

@@ -5,10 +5,10 @@ of the tiny scene, photographed at random and seen through a mask, with sparse p
 added to the rendered channels, because neighbours that show one Gaussian have one depth, at which an absolute
 difference has no derivative. Its
 inputs are the channels of the image, alpha, the fields of the population and the shared parameters: those that the
-cotangents name, and those with which the value changes, so that a derivative that is left out is wrong, too. What a
-term holds constant (``Rendered.constant``) does not move.
+cotangents name, and those with which the value changes, so that a derivative that is left out is wrong, too. Values
+that a term keeps constant (``Rendered.constant``) are not perturbed.
 
-A term does not tell its thresholds, such as the kink of an absolute value. So its differences have to settle
+A term does not report its thresholds, such as the kink of an absolute value. So its differences have to settle
 (:func:`minisplat_ref.oracle.differences.settled_derivative`).
 """
 
@@ -50,7 +50,7 @@ def loss_cases(
     term : LossTerm
         Whatever its weight.
     backend : Backend
-        That it is asked to use.
+        The one that it has to use.
     conventions : Conventions
         Profile of the check.
     representation : Representation
@@ -71,7 +71,7 @@ def loss_cases(
 def loss_stage(
     term: LossTerm, backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator
 ) -> Stage | None:
-    """Return a term as a function of what it depends on; None if it is zero and depends on nothing.
+    """Return a term as a function of its inputs; None if it is zero and depends on nothing.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def _by_name(v: Cotangents) -> dict[str, Floats]:
 
 
 def own_terms(own: Sequence[LossTerm], of_core: Sequence[LossTerm]) -> tuple[LossTerm, ...]:
-    """Return the terms whose function is none of the core's, each once."""
+    """Return the terms with a function from outside the core, each once."""
     functions = [_unbound(term) for term in of_core]
     found = {(term.name, _unbound(term)): term for term in own if _unbound(term) not in functions}
     return tuple(found.values())

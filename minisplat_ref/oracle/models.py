@@ -51,7 +51,7 @@ def check_model_gradients(
 ) -> Report:
     """Check the renderer of a representation, and further stages.
 
-    :func:`minisplat_ref.oracle.relatives.check_relative_gradients` checks all that an extension has of its own.
+    :func:`minisplat_ref.oracle.relatives.check_relative_gradients` checks everything that an extension adds.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def model_cases(
 
 
 def model_settings(conventions: Conventions) -> tuple[Setting, Setting, np.random.Generator]:
-    """Return the scene of the Jacobians, that of the inner products, and the generator of what follows."""
+    """Return the scene of the Jacobians, that of the inner products, and the generator for the rest."""
     rng = np.random.default_rng(SEED)
     return tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3), rng
 
@@ -126,11 +126,11 @@ def model_stage(
     Parameters
     ----------
     backend : Backend
-        That the renderer is asked to use.
+        The one that the renderer has to use.
     setting : Setting
         Gaussians and camera.
     representation : Representation
-        Makes the population and the shared parameters, and draws them.
+        Makes the population and the shared parameters, and renders them.
     rng : Generator
         For the noise.
     wants : frozenset of str, optional
@@ -194,7 +194,7 @@ def hit_sides(tiles: Iterable[TileHits]) -> list[np.ndarray]:
 def noisy_model(
     setting: Setting, view: View, representation: Representation, rng: np.random.Generator
 ) -> tuple[Model, Scene]:
-    """Return the Gaussians as a model of the representation, with noise in what is its own, and the scene of the view.
+    """Return the Gaussians as a model, with noise in the representation's additional fields, and the scene of the view.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 Most of these errors occurred in renderers that people use; the others are classic mistakes. Each wraps one stage of a
 given backend, so that the same error can be planted in the reference and in the kernels. An error in a forward formula
-is planted together with its own derivative: its gradients are correct for what it computes, and only a comparison finds
+is planted together with its own derivative: its gradients are consistent with its images, and only a comparison finds
 it. An error in a gradient does not change the image: only a check of gradients finds it.
 """
 

@@ -27,7 +27,7 @@ class Call(NamedTuple):
     n_channels: int = 0
     """Given colours of this many channels; 0: spherical harmonics."""
     has_own_colors: bool = False
-    """Whether each camera is given its own colours."""
+    """Whether each camera has its own colours."""
     is_antialiased: bool = False
     """Whether opacities are compensated."""
 

@@ -1,9 +1,9 @@
 """The gradient proof of a relative of 3DGS: everything that it has of its own, on every backend.
 
 That is its renderer, with every field and shared parameter and, where a recipe of it switches calibrations on, with
-these around it; its loss terms, but for those that a stage of its own replaces by its name; and the stages that it
-names. Renderer and stages must also compute the same on every backend. What it shares with 3DGS is checked without it.
-A relative that has nothing of its own to check does not pass: there is nothing that the check could have found.
+these around it; its loss terms, except those that a stage of the same name replaces; and the stages that it
+names. Renderer and stages must also compute the same on every backend. Everything that it shares with 3DGS is checked
+elsewhere. A relative without anything to check does not pass: the check could not have found an error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ class Relative(NamedTuple):
 
 
 def check_relative_gradients(backends: Sequence[Backend], conventions: Conventions, relative: Relative) -> Report:
-    """Check everything that a relative has of its own.
+    """Check everything that a relative adds to 3DGS.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def _own_representation(relative: Relative) -> Representation | None:
 
 
 def _with_calibrations(representation: Representation, recipe: Recipe) -> Representation:
-    """Return the representation as a recipe with calibrations draws it, with their parameters among the shared ones."""
+    """Return the representation with a recipe's calibrations, whose parameters are among the shared ones."""
 
     def shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
         own = dict(representation.shared(scene, rng))

@@ -23,7 +23,7 @@ class ComparedRenderer(NamedTuple):
     arrays: Callable[[Golden], Arrays]
     """Returns all arrays that it can for a scene with known truth; shapes as in the golden format."""
     rules: Callable[[Conventions], Conventions | None] = _as_they_are
-    """The conventions that it follows when a scene asks for these; None where it cannot render the scene at all."""
+    """The conventions that it follows for a scene with these; None where it cannot render the scene at all."""
     ignores: tuple[str, ...] = ()
     """Cotangents that it cannot take; they are set to zero for the truth as well."""
     scenes: tuple[str, ...] | None = None

@@ -1,4 +1,4 @@
-"""A scene on which to test gradients: small, and placed by hand where it matters.
+"""A small scene for testing gradients, with the decisive positions set by hand.
 
 It has a clamped hit, a pixel that stops early, a mean outside the clamp of the Jacobian on either axis, a colour below
 zero, a principal point off centre and a rotated camera: every branch of every gradient is taken. The Jacobian's limits
@@ -52,7 +52,7 @@ def make_setting(
     width, height : int
         Image, pixels.
     conventions : Conventions
-        Where its gradient is not the derivative of what is computed, as for INRIA's clamp, no alpha is clamped.
+        Where the gradient deviates from the derivative, as for INRIA's clamp, no alpha is clamped.
     sh_degree : int
         Stored and active.
 

@@ -256,7 +256,7 @@ def _view_point(tape: splatting.SplatTape) -> Point:
 
 
 def hit_sides(projection: Projection, bins: TileBins, conventions: Conventions) -> Sides:
-    """Return which Gaussians are listed, which hits are blended and which are clamped."""
+    """Return the listed Gaussians, the blended hits and the clamped hits."""
     tiles = list(tile_hits(projection, bins, conventions))
     blended = np.concatenate([np.ravel(tile.alphas > 0) for tile in tiles])
     return bins.gaussian_ids, bins.tile_offsets, blended, np.concatenate([np.ravel(tile.is_clamped) for tile in tiles])

@@ -1,4 +1,4 @@
-"""Pixels at a threshold: where rounding decides whether a hit counts, or which of two is in front, and how much.
+"""Pixels at a threshold, where rounding decides whether a hit counts or which of two is in front, and the effect.
 
 A renderer is full of comparisons, and its image or its gradient jumps at each of them:
 
@@ -16,8 +16,8 @@ median     the transmittance behind a hit with one half: whose depth is the    m
 
 Two correct renderers that round differently disagree at such pixels by a whole hit, and higher precision does not help.
 The pixels are found here, in float64, and comparisons set them aside: they are counted, not averaged into the
-arithmetic error, and excused only as far as the hits at their thresholds can change them. How near is near enough
-depends on what is rounded: see :class:`Margins`.
+arithmetic error, and excused only as far as the hits at their thresholds can change them. The margin within which a
+value counts as near depends on the rounding: see :class:`Margins`.
 
 Order is the threshold that can change a whole image. All Gaussians of a wall that a camera faces squarely have the same
 depth; if the camera is rotated against the world's axes, rounding the means spreads these depths by a relative 1e-8,
@@ -43,7 +43,7 @@ from minisplat_ref.types import Bools, Floats, Projection, TileBins, TileGrid
 
 
 class Thresholds(NamedTuple):
-    """What the thresholds can do to each pixel."""
+    """The possible effects of the thresholds on each pixel."""
 
     allowance: Floats
     """[H, W] upper bound of the change of any channel if hits at thresholds fall on the other side; mostly 0."""

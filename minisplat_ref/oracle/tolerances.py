@@ -1,4 +1,4 @@
-"""How much two results may differ: every tolerance of the oracle and of the benchmarks, each with its reason.
+"""Every tolerance of the oracle and of the benchmarks, each with its reason.
 
 In order: gradients against differences; reference and kernels against 50 digits and against a peer; another renderer
 against the reference, stage by stage; the benchmark's contenders; the groups of hard cases; and the margins at
@@ -90,8 +90,8 @@ TIE = 1e-4
 
 # --- the benchmark's contenders ---
 
-# What float32 promises of an image where no hit falls on the other side of a threshold: hundreds of hits, each with an
-# exponential of 1e-7 relative error at a distance that has lost digits to a coordinate of some hundred pixels.
+# The accuracy of an image in float32 where no hit falls on the other side of a threshold: hundreds of hits, each with
+# an exponential of 1e-7 relative error at a distance that has lost digits to a coordinate of some hundred pixels.
 BENCH_FLOAT32_IMAGE = 2e-5
 # The same of every parameter's gradient, relative L2, without the pixels at a threshold.
 BENCH_FLOAT32_GRADIENT = 1e-4
@@ -118,7 +118,7 @@ class HardCaseTolerance(NamedTuple):
     """
 
     reason: str
-    """Why these; one line."""
+    """The reason for these values, one line."""
     image64: float
     """Of the kernels in float64."""
     gradient64: float
@@ -202,13 +202,13 @@ BLOCK_FLOOR = 1e-2
 
 
 class Margins(NamedTuple):
-    """How near to a threshold a value has to be for rounding to decide on which side it falls.
+    """The distance from a threshold within which rounding decides on which side a value falls.
 
     Margins are relative to the threshold, as rounding is; see :mod:`minisplat_ref.oracle.thresholds`.
     """
 
     reason: str
-    """Why these; one line."""
+    """The reason for these values, one line."""
     skip: float
     """Of a hit's alpha from ``alpha_min``."""
     clamp: float
@@ -218,7 +218,7 @@ class Margins(NamedTuple):
     median: float
     """Of the same from one half."""
     place: float
-    """Of a pixel coordinate, how far it may be off; a hit's alpha changes with it as its Gaussian is steep there."""
+    """The error of a pixel coordinate; a hit's alpha changes with it in proportion to the slope of its Gaussian."""
     order: float
     """Of the depth of a hit from that of the one before; those that are one float32 are always near enough."""
 
@@ -233,7 +233,7 @@ FLOAT32_RENDERER = Margins(
     place=0.0,  # it is in the others
     order=5e-7,
 )
-"""Of any correct renderer in float32, whose own projection is compared."""
+"""For any correct renderer in float32 that computes its own projection."""
 
 OWN_KERNELS = Margins(
     "footprints and depths come from float64: what is left is rounding of 6e-8 in exponent and exponential, twice in"

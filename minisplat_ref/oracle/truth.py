@@ -1,4 +1,4 @@
-"""A truth more precise than float64: compute, from definitions and in 50 digits, what loses digits in our formulas.
+"""A truth more precise than float64: quantities whose formulas lose digits, from their definitions and in 50 digits.
 
 Nothing here is one of our formulas. A rotation is the sandwich product q v q*; a projected covariance uses the
 numerical derivative of the camera's map itself; an inverse is a linear solve; the densest point of a ray is a minimum;
@@ -6,7 +6,7 @@ transmittance is a product. This gives error figures for the float64 reference, 
 project in float64, and for the textbook's formulas in float32, which are the reference on float32 data:
 ``R mu + t``, ``A Sigma A^T``, ``a c - b^2``.
 
-A relative error is divided by the condition number of what is computed, the factor by which any formula may enlarge
+A relative error is divided by the condition number of the quantity, the factor by which any formula may enlarge
 the rounding of its input: for positions the distance to the world's origin over the depth, for conics that times the
 condition number of the projected covariance.
 """

@@ -85,7 +85,7 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
     camera : Camera
         The view; its principal point is used.
     dominant_ids : ndarray of shape (H, W)
-        Gaussian of each pixel, -1 for none: :attr:`BlendStats.dominant_ids`.
+        Gaussian of each pixel, -1 for none: :attr:`minisplat_ref.types.BlendStats.dominant_ids`.
 
     Returns
     -------

@@ -7,7 +7,7 @@ from minisplat_ref.jit.literals import ONE
 
 @scalar
 def scale_of(log_scale, largest):
-    """Return s = exp(log_s), at most ``largest``, which takes the place of infinity."""
+    """Return s = exp(log_s), at most ``largest``, which replaces infinity."""
     return minimum(exp_of(log_scale), largest)
 
 

@@ -1,7 +1,7 @@
 """Alpha blending of one hit at one pixel (3DGS equations (3) and (4)), forward and backward.
 
 The functions take eight pixels at a time (``lanes``), with ``select`` instead of branches. A finished pixel stores its
-transmittance negated: no later hit passes the stop test, and no second array has to say which pixels are finished.
+transmittance negated: no later hit passes the stop test, and no second array has to mark the finished pixels.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Where the ray of one pixel meets one Gaussian: at its greatest density (Mini-Splatting appendix D).
+"""The depth at which the ray of one pixel meets one Gaussian, at its greatest density (Mini-Splatting appendix D).
 
 In the Gaussian's own axes, with p the mean relative to the ray's origin and r the ray's direction, the density along
 o + t d is greatest at the weighted least-squares solution of p = t r:

@@ -1,4 +1,4 @@
-"""Which pixels one projected Gaussian may touch: radii and a half-open box of pixels inside the image.
+"""The pixels that one projected Gaussian may touch: radii and a half-open box of pixels inside the image.
 
 All results are whole numbers stored as floats. Boxes are clamped to the image, and radii, once the boxes are made, to
 the range of int32, so that the cast to integers is defined.

@@ -30,7 +30,7 @@ class Pose(NamedTuple):
 
 
 class ProjectionConstants(NamedTuple):
-    """What is the same for all Gaussians of a view: the camera and the conventions, as scalars of the data's dtype."""
+    """The constants of a view: the camera and the conventions, as scalars of the data's dtype."""
 
     fx: float
     fy: float

@@ -1,4 +1,4 @@
-"""How much one channel of one pixel would change without one Gaussian; see ``reference.removal``."""
+"""The change of one channel of one pixel without one Gaussian; see ``reference.removal``."""
 
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import minimum, select

@@ -1,4 +1,4 @@
-"""How far one Gaussian's visible ellipse reaches within a band of pixel rows.
+"""The extent of one Gaussian's visible ellipse within a band of pixel rows.
 
 The ellipse is the set a (dx + slope dy)^2 + pivot dy^2 <= q with q = 2 ln(opacity / alpha_min) and the factors a, slope
 and pivot of the conic: outside it, alpha is below alpha_min. The ellipse is convex: its rightmost point within a band

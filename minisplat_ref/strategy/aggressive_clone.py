@@ -1,4 +1,4 @@
-"""Aggressive clone of Mini-Splatting2: clone the Gaussians that matter without changing the image.
+"""Aggressive clone of Mini-Splatting2: clone the important Gaussians without changing the image.
 
 A plain copy makes a Gaussian more opaque. Here the N copies share the opacity and the size of the one that they replace
 (the rule by which 3DGS-MCMC relocates Gaussians). With its opacity o and scales s,
@@ -7,10 +7,10 @@ A plain copy makes a Gaussian more opaque. Here the N copies share the opacity a
     s' = s o / sum_k C(N, k) (-1)^(k+1) o'^k / sqrt(k)        k = 1 ... N
 
 The latter holds because along a line through the centre, where one copy has alpha u(x) = o' exp(-x^2 / 2 s'^2), N have
-1 - (1 - u)^N, a sum of Gaussians of widths s' / sqrt(k), whose integral is that of the old profile, sqrt(2 pi) s o.
+1 - (1 - u)^N, a sum of Gaussians of widths s' / sqrt(k) with the integral of the old profile, sqrt(2 pi) s o.
 
-There are two readings of *critical*, the released code's and the paper's, and they differ a lot. Left out: what the
-released code removes just before, which is an action of the recipe.
+There are two readings of *critical*, the released code's and the paper's, and they differ a lot. Left out: the removal
+just before it in the released code, which is an action of the recipe.
 """
 
 import math
@@ -29,7 +29,7 @@ From the released code. Its other bound, 1 - 1e-7, is not needed: the logits are
 
 
 def critical_by_mass(stats: ImportanceStats, mass: float = 0.99) -> Bools:
-    """Return which Gaussians carry ``mass`` of the blend weight among those that dominate a pixel: the released code.
+    """Return which Gaussians carry ``mass`` of the blend weight among those that dominate a pixel, as in released code.
 
     This is a large part of all Gaussians.
 
@@ -47,7 +47,7 @@ def critical_by_mass(stats: ImportanceStats, mass: float = 0.99) -> Bools:
 
 
 def critical_by_weight(stats: ImportanceStats, quantile: float = 0.99) -> Bools:
-    """Return which Gaussians have the largest blending weights, as the paper says.
+    """Return which Gaussians have the largest blending weights, as in the paper.
 
     This is one in a hundred, and more where the weights of many reach alpha's upper bound.
 

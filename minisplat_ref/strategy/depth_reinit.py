@@ -1,16 +1,16 @@
-"""Depth reinitialisation (Mini-Splatting, Sec. 4.1): replace all Gaussians by points of the surface that they show.
+"""Depth reinitialisation (Mini-Splatting, Sec. 4.1): replace all Gaussians by points of the rendered surface.
 
 Trained Gaussians crowd where gradients were large and leave plain surfaces to few. A fresh set with equally many points
-per photograph covers the scene evenly. A point lies where a pixel's ray meets what the pixel shows, and its colour is
+per photograph covers the scene evenly. A point lies where a pixel's ray meets the visible surface, and its colour is
 the photograph's. The paper compares three definitions of "where" (Table 4):
 
 - midpoint: the densest point of the dominant Gaussian on the ray (appendix D), the default;
 - centre: the ray at the depth of the dominant Gaussian's mean;
 - blended: the ray at the blended depth, ``sum w z / sum w``.
 
-The paper says that pixels are chosen at random; the released code draws them with probability proportional to the
-accumulated opacity, and so do we. Two safeguards are ours, for places where the photographs do not determine the depth,
-such as sky and bare walls: a least accumulated opacity of drawn pixels, and a vote of other views on each point.
+In the paper pixels are chosen at random; the released code draws them with probability proportional to the accumulated
+opacity, and so do we. Two safeguards are ours, for places where the photographs do not determine the depth, such as sky
+and bare walls: a minimum of the accumulated opacity of chosen pixels, and a vote of other views on each point.
 
 Left out: in the released kernel a Gaussian whose densest point lies behind the camera does not change the
 transmittance. Here such a pixel has no point.
@@ -41,7 +41,7 @@ N_PROBES = 256  # points of a view with which its partners are chosen
 
 
 class PixelPoints(NamedTuple):
-    """Where the ray of each pixel's centre meets what the pixel shows."""
+    """The point where the ray of each pixel's centre meets the visible surface."""
 
     points: Floats
     """[H, W, 3] world frame; 0 where there is none."""
@@ -127,7 +127,7 @@ def reinitial_points(
     """Draw points of the surface that the Gaussians show, equally many from every view.
 
     Within a view pixels are drawn without replacement, with probability proportional to the accumulated opacity. Where
-    fewer pixels can be drawn than asked for, all of them are. Masked pixels are never drawn.
+    fewer pixels can be drawn than requested, all of them are. Masked pixels are never drawn.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def find_refuted(
     cameras : sequence of Camera
         Of all views.
     depth_maps : sequence of ndarray of shape (H, W)
-        Camera z of what each view sees, world units; 0 where it sees nothing.
+        Camera z of the surface in each view, world units; 0 where there is none.
     tolerance : float
         Relative difference of two depths of the same surface.
 

@@ -1,13 +1,13 @@
-"""The error of the images that each Gaussian is responsible for: the sum of error times blend weight.
+"""The part of the images' error that each Gaussian is responsible for: the sum of error times blend weight.
 
-A Gaussian that covers much of what is wrong deserves more Gaussians in its place than one that moves a lot, which the
-gradient of its centre measures: that vanishes, too, where the pulls of a pixel on either side cancel. With the error e
-of a pixel, the mean of the channels' absolute residuals, and the weight w of a hit::
+A Gaussian that covers much of the error is a better candidate for a split than one that moves a lot, which the gradient
+of its centre measures: that gradient also vanishes where the pulls of the pixels on either side cancel. With the error
+e of a pixel, the mean of the channels' absolute residuals, and the weight w of a hit::
 
     E_i = sum over pixels of w_i e
 
 A rendering is ``sum w c`` and a colour linear in its coefficient of degree 0, so this is the gradient with respect to
-``sh_dc`` for the cotangent e in all channels, and needs no kernel of its own. Left out are channels of a Gaussian that
+``sh_dc`` for the cotangent e in all channels, and needs no further kernel. Left out are channels of a Gaussian that
 are clamped to black.
 """
 

@@ -1,4 +1,4 @@
-"""Growth that hardly changes the image: replace a Gaussian by two halves, side by side on its longest axis.
+"""Growth that hardly changes the image: each Gaussian becomes two halves, side by side on its longest axis.
 
 A clone of 3DGS doubles the opacity where it is put, and a child of its split lands at random: both spoil the image,
 and the next iterations repair it. Here the two halves together have the mean, the covariance and the optical depth of
@@ -7,7 +7,7 @@ the Gaussian that they replace. With the offset d from its centre, in standard d
     mu' = mu +- d s_k R_k        s_k' = sqrt(1 - d^2) s_k              keeps mean and covariance of the equal mixture
     tau = -ln(1 - o)             tau' = tau / (2 sqrt(1 - d^2))        keeps the integral of tau exp(-x^2 / 2)
 
-The latter holds because the integral of a Gaussian is proportional to its height and its width. In place of the clones
+The latter holds because the integral of a Gaussian is proportional to its height and its width. Instead of the clones
 and splits of 3DGS the halves gain 0.6 dB with a quarter of the Gaussians (``docs/measured/adaptive.md``).
 """
 
@@ -58,7 +58,7 @@ def halves(gaussians: Gaussians, parent_ids: Ints, *, offset: float = OFFSET) ->
 
 
 def thin_logits(opacity_logits: Floats, factor: float) -> Floats:
-    """Return the logits of Gaussians whose optical depth is ``factor`` times as large: 1 - o' = (1 - o)^factor.
+    """Return the logits of Gaussians with ``factor`` times the optical depth: 1 - o' = (1 - o)^factor.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Importance of each Gaussian to the training views (Mini-Splatting, Sec. 3.2 and appendix E), and which carry most.
+"""Importance of each Gaussian to the training views (Mini-Splatting, Sec. 3.2 and appendix E), and the selection by it.
 
 The weight w = alpha T of a hit is a Gaussian's share of a pixel. Everything here is a sum, a maximum or a count of
 weights over the pixels of all training views. The Gaussian with the largest weight at a pixel *dominates* it.
@@ -93,7 +93,7 @@ def indoor(stats: ImportanceStats) -> Floats:
 def outdoor(stats: ImportanceStats) -> Floats:
     """Return the importance [N] for outdoor scenes: mean weights per touched pixel, added up over the views.
 
-    Only views in which the Gaussian dominates a pixel count; how many pixels it covers there does not.
+    Only views in which the Gaussian dominates a pixel count; the number of pixels that it covers there does not.
     """
     return stats.mean_weight_sum
 

@@ -17,7 +17,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Scene
 N_NEIGHBOURS = 3
 SQUARED_DISTANCE_MIN = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
 INITIAL_OPACITY = 0.1
-N_RANDOM_POINTS = 100_000  # as 3DGS draws for scenes without points
+N_RANDOM_POINTS = 100_000  # as in 3DGS for scenes without points
 
 IsInside = Callable[[Floats, Camera], Bools]
 """``is_inside(points, camera)``: [P] whether points [P, 3] of the world are inside the camera's image."""
@@ -26,8 +26,8 @@ IsInside = Callable[[Floats, Camera], Bools]
 def may_be_inside(points: Floats, camera: Camera) -> Bools:
     """Return for each point [P, 3] whether a camera may have it inside its image, [P]; of a pinhole, whether it has.
 
-    What a lens does is not known here (:mod:`minisplat_ref.mechanisms.cameras` stands above), so a camera with optics
-    counts as seeing all that its kind may: a fisheye and parallel rays every point, others what is in front of them.
+    Lenses are not known here (:mod:`minisplat_ref.mechanisms.cameras` is a layer above), so a camera with optics
+    counts as seeing all that its kind may: a fisheye and parallel rays every point, others the points in front of them.
     """
     x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
     is_in_front = z > 0

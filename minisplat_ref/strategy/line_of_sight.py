@@ -1,4 +1,4 @@
-"""What lies before the sparse points: a photograph that shows a point says that the ray up to the point is free.
+"""Free lines of sight: where a photograph shows a sparse point, nothing may lie on the ray in front of it.
 
 Structure from motion has found each sparse point in several photographs. In each of them the point lies on the ray
 through its pixel at a known depth d, and whatever a model blends at less than ``(1 - margin) d`` on that ray cannot be
@@ -35,7 +35,7 @@ class SightLines(NamedTuple):
     rays: Ints
     """[M] ray of the hit, an index from 0 to R - 1."""
     weights: Floats
-    """[M] w, its part of what the ray shows."""
+    """[M] w, its weight on the ray."""
     is_before: Bools
     """[M] whether it is nearer than the point."""
     transmittances: Floats
@@ -43,12 +43,12 @@ class SightLines(NamedTuple):
 
 
 def trace_sight_lines(model: Model, view: View, points: Floats, settings: RenderSettings, margin: float) -> SightLines:
-    """Return what a view blends on the rays to its sparse points.
+    """Return the contributions that a view blends on the rays to its sparse points.
 
     Parameters
     ----------
     model : Model
-        Of Gaussians, which are drawn as they are: without exposures, poses or a sky.
+        Of Gaussians, which are rendered as they are: without exposures, poses or a sky.
     view : View
         With ``point_ids``.
     points : ndarray of shape (P, 3)
@@ -84,7 +84,7 @@ def trace_sight_lines(model: Model, view: View, points: Floats, settings: Render
 def hidden_share(
     model: Model, views: Sequence[View], points: Floats, settings: RenderSettings, margin: float = MARGIN
 ) -> float | None:
-    """Return which part of the sparse points, view by view, a model hides; None if no view has any.
+    """Return the fraction of the sparse points, view by view, that a model hides; None if no view has any.
 
     Parameters
     ----------

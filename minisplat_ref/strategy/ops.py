@@ -1,7 +1,7 @@
 """Row operations on a population, which is any NamedTuple of [N, ...] arrays.
 
-Parameters, Adam moments and gradients go through the same functions, so a population with further fields needs no code
-of its own.
+Parameters, Adam moments and gradients go through the same functions, so a population with further fields needs no
+additional code.
 """
 
 from typing import Any, NamedTuple, TypeVar

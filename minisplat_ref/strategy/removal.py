@@ -1,4 +1,4 @@
-"""What the removal of each Gaussian would cost, in squared error, and which ones are not worth their place.
+"""The cost of removing each Gaussian, in squared error, and the Gaussians that are not worth their place.
 
 :mod:`minisplat_ref.reference.removal` has S_i, the squared change of an image without Gaussian i: where the training
 has converged, the increase of the squared error. Summed over the views it has a unit, unlike blend weight, which counts
@@ -7,8 +7,8 @@ of the N Gaussians, it is the slope of the curve of error over count at Gaussian
 
     slope_i = N S_i / E = -(d ln E / d ln N)          3 slope_i dB for each doubling of the count
 
-The others learn to replace what is gone, so the true loss is smaller; and S is not additive. So Gaussians are removed a
-slice at a time, and S is computed again when the training has continued for a while.
+Training adapts the others to replace what is gone, so the true loss is smaller; and S is not additive. So Gaussians are
+removed a slice at a time, and S is computed again when the training has continued for a while.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ from minisplat_ref.rendering import RenderSettings, as_model
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.types import Floats, Ints, View
 
-CHANGES = "removal_changes"  # name of S in what a renderer can be asked for
+CHANGES = "removal_changes"  # name of S in the requests to a renderer
 
 
 class RemovalCosts(NamedTuple):
-    """What the views say about the removal of each Gaussian alone."""
+    """The change of the views by the removal of each Gaussian alone."""
 
     changes: Floats
     """[N] S, summed over all pixels, masked ones included, channels and views; before any exposure of a photograph."""
@@ -52,7 +52,7 @@ def collect_removal_costs(model: Any, views: Sequence[View], settings: RenderSet
     Raises
     ------
     InputError
-        The renderer does not know what a removal changes.
+        The renderer cannot compute the change by a removal.
     """
     model = as_model(model)
     changes, squared_error = np.zeros(n_rows(model.gaussians)), 0.0

@@ -1,7 +1,7 @@
-"""Simplification: keep few Gaussians that show nearly the same (Mini-Splatting, equation 3).
+"""Simplification: keep few Gaussians whose image is nearly the same (Mini-Splatting, equation 3).
 
-Importance (:mod:`minisplat_ref.strategy.importance`) says how much a Gaussian matters to the training views. There are
-four ways to use it, to be compared at equal numbers of Gaussians:
+Importance (:mod:`minisplat_ref.strategy.importance`) measures a Gaussian's contribution to the training views. There
+are four ways to use it, to be compared at equal numbers of Gaussians:
 
 - sampling, the paper's: draw Gaussians with probability proportional to importance, so that plain regions keep some;
 - rank: keep the most important ones;
@@ -111,12 +111,12 @@ def by_sampling(gaussians: Gaussians, importance: Floats, n: int, rng: np.random
 
 
 def by_rank(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
-    """Keep the ``n`` Gaussians of :func:`most_important`; nothing is drawn."""
+    """Keep the ``n`` Gaussians of :func:`most_important`, without random numbers."""
     return keep(gaussians, most_important(importance, n))
 
 
 def by_merging(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
-    """Merge down to ``n`` Gaussians with :func:`merge_neighbours`; nothing is drawn."""
+    """Merge down to ``n`` Gaussians with :func:`merge_neighbours`, without random numbers."""
     return merge_neighbours(gaussians, importance, n)
 
 
@@ -131,7 +131,7 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
         Sigma = sum w_m (Sigma_m + d_m d_m^T) / sum w_m     quaternion and scales by its eigenvectors and eigenvalues
         tau A = sum tau_m A_m,   o = 1 - exp(-tau)
 
-    tau is the optical thickness of a Gaussian, and A, with A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2, stands for its
+    tau is the optical thickness of a Gaussian, and A, with A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2, is a measure of its
     cross-section. So two in one place, merged, absorb as much light as before, and two side by side become a larger one
     of about their opacity.
 

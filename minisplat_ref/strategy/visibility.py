@@ -1,9 +1,9 @@
-"""Visibility culling of Mini-Splatting2: draw each training view only with the Gaussians that matter to it.
+"""Visibility culling of Mini-Splatting2: render each training view only with the Gaussians that matter to it.
 
 A Gaussian is *visible* in a view if it belongs to the most important ones that together carry 0.99 of the view's blend
 weight (:func:`minisplat_ref.strategy.importance.collect_importance`). The table [N, V] of this visibility is measured
 now and then, with culling off, on the training views alone; in between, children inherit their parent's row. Left out:
-skipping the others when a view is drawn, which the renderer does.
+skipping the others when a view is rendered, which the renderer does.
 """
 
 import numpy as np
@@ -42,8 +42,8 @@ def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
 def find_seen_by_few(is_visible: Bools, min_views: int) -> Bools:
     """Return which Gaussians are visible in fewer than ``min_views`` training views.
 
-    Depth from one view is a guess; the released code removes what fewer than two views see. In a scene with two views
-    this would leave next to nothing, so at most half of the views, rounded up, are required.
+    Depth from one view is a guess; the released code removes Gaussians that fewer than two views see. In a scene with
+    two views this would leave next to nothing, so at most half of the views, rounded up, are required.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Conditions under which claims train a scene: as it is, with few photographs, and with a known defect.
 
 A disturbance is the same for every recipe and seed, so that trainings under one condition differ in nothing else.
-(:mod:`.defects` plants another one in every trial.) Test views stay as they are but under ``sky``.
+(:mod:`data_tools.claims.defects` plants another one in every trial.) Test views stay as they are but under ``sky``.
 
 =============  =====================================================================================================
 ``whole``      the scene as it is

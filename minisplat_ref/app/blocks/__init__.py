@@ -10,8 +10,8 @@ independently of each other, on one machine or on many (``minisplat-ref train SC
 3. *Blocks.* Each starts from the coarse model's Gaussians in its region, and is an ordinary run.
 4. *Merge.* Of each block the Gaussians in its core.
 
-Dividing by cameras and deciding by visibility follow VastGaussian and CityGaussian; what is left out of theirs:
-appearance per photograph, levels of detail, and blocks that talk to each other while they train (DOGS).
+Dividing by cameras and deciding by visibility follow VastGaussian and CityGaussian; left out: appearance per
+photograph, levels of detail, and blocks that communicate while they train (DOGS).
 
 ============  ====================================================================================================
 ``grid``      cores and regions on the plane, from where the cameras are
@@ -19,6 +19,6 @@ appearance per photograph, levels of detail, and blocks that talk to each other 
 ``plan``      the plan, its file and its parts
 ``picture``   the plan as a picture
 ``merge``     one model of all blocks, as an ordinary run
-``train``     the four phases, in turn or by workers, continued where they were
+``train``     the four phases, one by one or by workers, continued where they were
 ============  ====================================================================================================
 """

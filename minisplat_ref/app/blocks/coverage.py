@@ -1,4 +1,4 @@
-"""Which pixels of a photograph show a block, by the Gaussian of a coarse model that weighs most in each."""
+"""The pixels of a photograph that show a block, by the Gaussian of a coarse model that weighs most in each."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,16 +17,16 @@ TRAIN_VIEWS_MIN = 2  # photographs without which nothing can be trained
 
 
 class Coverage(NamedTuple):
-    """What the training views show of the blocks."""
+    """The pixels of the training views that show the blocks."""
 
     masks: list[dict[str, Bools]]
-    """For each block, by the name of the photograph: [H, W] of what it may learn from."""
+    """For each block, by the name of the photograph: mask [H, W] of the pixels that it is trained on."""
     trained: float
     """Part of the pixels that show the scene, of all photographs, which at least one block learns from."""
 
 
 class Coarse(NamedTuple):
-    """The coarse model, and how it is drawn."""
+    """The coarse model, and its renderer."""
 
     model: Model
     render_settings: RenderSettings

@@ -12,7 +12,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.types import Floats
 
 OVERLAP = 0.2  # of a core's width, which its region adds on each side: 20 % as in VastGaussian
-FLAT = 1e-6  # of the cameras' extent: what is thinner has no width to divide
+FLAT = 1e-6  # of the cameras' extent: a thinner region has no width to divide
 
 
 class Block(NamedTuple):
@@ -21,9 +21,9 @@ class Block(NamedTuple):
     name: str
     """Its indices along the first and the second axis, such as ``0-1``."""
     core: Box
-    """What the merged model takes of it; the outermost cores have no outer edge."""
+    """The part that the merged model takes; the outermost cores have no outer edge."""
     region: Box
-    """What it trains: the core and what is around it."""
+    """The part that it trains: the core and its surroundings."""
     n_cameras: int
     """In the core."""
 
@@ -67,7 +67,7 @@ def divide(coordinates: Floats, shape: tuple[int, int]) -> list[Block]:
     Raises
     ------
     InputError
-        There are too few cameras, or too many stand in one line to be divided so.
+        There are too few cameras, or too many are in one line to be divided like this.
     """
     n_slabs, n_in_slab = shape
     reach = float(np.ptp(coordinates, axis=0).max())
@@ -82,7 +82,7 @@ def divide(coordinates: Floats, shape: tuple[int, int]) -> list[Block]:
 
 
 def widen(core: Box, inside: Floats) -> Box:
-    """Return a core with its surroundings; where it has no edge, its cameras [V, 2] say how wide it is."""
+    """Return a core with its surroundings; where it has no edge, its cameras [V, 2] determine its width."""
     low, high = [], []
     for axis in range(2):
         first = core.low[axis] if math.isfinite(core.low[axis]) else float(inside[:, axis].min())

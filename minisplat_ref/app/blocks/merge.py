@@ -18,7 +18,7 @@ from minisplat_ref.types import Bools, Floats, Scene
 
 
 def merge(asked: Asked, plan: Plan, scene: Scene) -> tuple[TrainState, list[str]]:
-    """Return the state of the merged model after its last iteration, and what is left out of it, as sentences.
+    """Return the state of the merged model after its last iteration, and sentences about what is left out of it.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def in_core(plan: Plan, planned: Planned, points: Floats) -> Bools:
 def write_history(asked: Asked, plan: Plan, state: TrainState) -> None:
     """Write the log of the whole: the coarse training's, and a record of the end with the time of all trainings.
 
-    Loss and PSNR of that record are the means of what the blocks' own last records say, of their pixels.
+    Loss and PSNR of that record are the means of those in the blocks' own last records, over their pixels.
     """
     coarse = read_log(asked.run_folder_of(COARSE) / run_folder.LOG)
     last = [read_log(asked.run_folder_of(planned.block.name) / run_folder.LOG)[-1] for planned in plan.blocks]

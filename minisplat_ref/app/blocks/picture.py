@@ -1,4 +1,4 @@
-"""The plan seen from above: what the coarse model holds, the cores, and the cameras in the colours of their blocks."""
+"""The plan seen from above: the coarse model, the cores, and the cameras in the colours of their blocks."""
 
 import math
 from pathlib import Path
@@ -13,7 +13,7 @@ from minisplat_ref.interface.palette import TITLE_COLOR
 from minisplat_ref.types import Floats
 
 SIZE = (6.4, 5.6)  # inches
-MARGIN = 0.25  # of what the cameras occupy, shown around them
+MARGIN = 0.25  # of the cameras' extent, shown around them
 N_POINTS_MAX = 20000  # of the coarse model, so that the picture stays small
 COLOR_MAP = "tab20"
 

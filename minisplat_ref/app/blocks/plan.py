@@ -1,12 +1,12 @@
-"""The plan of a training in blocks: what was asked for, the blocks, and their trainings; and how the folder holds it.
+"""The plan of a training in blocks: the settings, the blocks, and their trainings; and its files in the folder.
 
 ::
 
     DIR/plan.json            the grid; once it is planned, the blocks
     DIR/plan.png             the plan seen from above
-    DIR/blocks/config.json   the settings that were asked for
+    DIR/blocks/config.json   the requested settings
     DIR/blocks/coarse/       run folder of the coarse model
-    DIR/blocks/0-1.json      what block 0-1 trains on, and 0-1.npz
+    DIR/blocks/0-1.json      the part that block 0-1 trains on, and 0-1.npz
     DIR/blocks/0-1/          its run folder
     DIR/...                  an ordinary run folder, of the merged model
 """
@@ -36,7 +36,7 @@ from minisplat_ref.types import Floats, Scene
 
 PLAN = "plan.json"
 COARSE = "coarse"
-COARSE_RECIPE = "3dgs-accel"  # its Gaussians are what every recipe can start from
+COARSE_RECIPE = "3dgs-accel"  # every recipe can start from its Gaussians
 COARSE_PART = 4  # a quarter of the iterations of a training of the whole
 COARSE_ITERATIONS = 1000  # for recipes that decide their own length
 PIXEL_BYTES = 4  # of a photograph, three, and of its mask
@@ -45,7 +45,7 @@ FRESH: dict[str, Any] = {"extension": None, "set": {}, "simplify": None, "scene_
 
 
 class Asked(NamedTuple):
-    """What was asked for."""
+    """The requested settings."""
 
     folder: Path
     settings: Settings
@@ -55,7 +55,7 @@ class Asked(NamedTuple):
 
     @property
     def blocks_folder(self) -> Path:
-        """Where the trainings are."""
+        """The folder of the trainings."""
         return self.folder / run_folder.BLOCKS
 
     def run_folder_of(self, name: str) -> Path:
@@ -79,8 +79,8 @@ class Planned(NamedTuple):
     iterations: int
     """Of its training."""
     megabytes: int
-    """Of its photographs with their masks, and of its first Gaussians while they are trained; what a process takes
-    anyway, and what Gaussians are added, comes on top."""
+    """Of its photographs with their masks, and of its first Gaussians while they are trained; the process itself, and
+    Gaussians that are added, come on top."""
 
 
 class Plan(NamedTuple):
@@ -117,7 +117,7 @@ def begin(asked: Asked, config: dict[str, Any]) -> None:
 
 
 def load_asked(folder: Path) -> Asked:
-    """Read what :func:`begin` wrote.
+    """Read the file of :func:`begin`.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def make_plan(asked: Asked, listing: Listing, scene: Scene, coarse: Coarse, cent
 
 
 def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> str | None:
-    """Return a sentence if the largest blocks of so many workers of this machine do not fit beside each other."""
+    """Return an error message if the largest blocks of all workers together exceed this machine's memory."""
     largest = sorted((planned.megabytes for planned in plan.blocks), reverse=True)[:n_workers]
     if 1e6 * sum(largest) <= free_bytes:
         return None
@@ -187,12 +187,12 @@ def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> st
 
 
 def save_plan(asked: Asked, plan: Plan) -> None:
-    """Write ``plan.json``, after all that it speaks of is there."""
+    """Write ``plan.json``, after everything that it refers to."""
     run_folder.write_json(asked.folder / PLAN, to_json(asked, plan))
 
 
 def load_coarse(asked: Asked, scene: Scene) -> Coarse:
-    """Read the coarse model, and how it is drawn before the scene's background."""
+    """Read the coarse model, and its renderer with the scene's background."""
     folder, settings = asked.run_folder_of(COARSE), asked.coarse
     model = load_model(folder, settings)
     conventions, backend = PROFILES[settings.profile], get_backend(settings.backend)

@@ -1,6 +1,6 @@
 """The four phases of a training in blocks, each from where it was: coarse, plan, blocks, merge.
 
-The trainings are processes, in turn or by workers; plan and merge are done here. Everything that a phase needs is on
+The trainings are processes, one by one or by workers; plan and merge are done here. Everything that a phase needs is on
 disk, so that a run that was killed anywhere continues, and ends with the same bytes.
 """
 
@@ -40,7 +40,7 @@ from minisplat_ref.types import Scene
 
 
 def check(settings: Settings, recipe: Recipe, state: TrainState) -> None:
-    """Refuse a recipe whose model is more than Gaussians that can be put side by side.
+    """Refuse a recipe whose model is more than Gaussians that can be concatenated.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def train_coarse(asked: Asked, workers: Workers) -> int:
 
 
 def plan_blocks(asked: Asked) -> Plan:
-    """Return the plan, which is made and drawn if there is none yet.
+    """Return the plan; make it, and its picture, if there is none yet.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def train_blocks(asked: Asked, plan: Plan, workers: Workers) -> int:
 
 
 def merged(asked: Asked, plan: Plan) -> tuple[Scene, Recipe, TrainState]:
-    """Return what the run of the whole ends with; what a merge leaves out is said."""
+    """Return the end of the run of the whole; parts that a merge leaves out are reported."""
     scene = load_photographs(asked.settings)
     state, left_out = merge(asked, plan, scene)
     for sentence in left_out:
@@ -118,7 +118,7 @@ def is_unfinished(folder: Path) -> bool:
 
 
 def _train(asked: Asked, trainings: dict[str, Settings], workers: Workers) -> int:
-    """Take trainings to their ends, in turn or by workers; return the exit code."""
+    """Complete trainings, one by one or by workers; return the exit code."""
     jobs, folder = [], asked.folder.resolve()
     for name, settings in trainings.items():
         run = asked.run_folder_of(name)
@@ -142,7 +142,7 @@ def _title(name: str) -> str:
 
 
 def next_words(folder: Path, name: str) -> Sequence[str] | None:
-    """Return the command that takes a training of a folder from where it is to its end; called on the worker."""
+    """Return the command that completes the training of a folder; called on the worker."""
     asked = load_asked(folder)
     if name == COARSE:
         settings = asked.coarse

@@ -1,4 +1,4 @@
-"""The parts of test views that are worth a look: where the recipes differ most, and where there is most detail."""
+"""Crops of test views for inspection: where the recipes differ most, and where there is most detail."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from minisplat_ref.app.reports.images import Image8, to_8_bits
 from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.types import Floats, Scene, View
 
-N_CROPS = 4  # half of them chosen where the recipes differ, which by itself would show only what goes wrong
+N_CROPS = 4  # half of them chosen where the recipes differ, which alone would show only failures
 CROP_FRACTION = 0.3  # of a view's width and height
 
 
@@ -19,7 +19,7 @@ class Crop(NamedTuple):
     view: str
     """Name of the view."""
     reason: str
-    """Why it is shown."""
+    """The reason why it is shown."""
     truth: Image8
     """[h, w, 3] photograph, sRGB."""
     renders: tuple[Image8, ...]
@@ -27,7 +27,7 @@ class Crop(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """A crop, and how much it holds of what was looked for."""
+    """A crop, and its score in the search."""
 
     score: float
     crop: Crop
@@ -70,7 +70,7 @@ def _best_crop(view: View, renders: Sequence[Image8], values: Floats, reason: st
 
 
 def difference(truth: Image8, renders: Sequence[Image8]) -> Floats:
-    """Return per pixel [H, W] how far the errors of the renders are apart, in levels of 8 bits."""
+    """Return per pixel [H, W] the range of the errors of the renders, in levels of 8 bits."""
     errors = np.array([np.abs(image.astype(np.float64) - truth).mean(axis=2) for image in renders])  # [M, H, W]
     return errors.max(axis=0) - errors.min(axis=0)
 

@@ -1,4 +1,4 @@
-"""What finished run folders say in numbers, and what the seeds and folds of a recipe say together."""
+"""Metrics of finished runs, and their aggregates over seeds and folds."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,11 +21,11 @@ class Metric(NamedTuple):
     key: str
     """Name in compare.json."""
     title: str
-    """What it is, with its unit."""
+    """Its meaning, with the unit."""
     format: str
     """Of a value."""
     relation: Literal["ratio", "difference"] | None
-    """How a recipe is set against the first; decibels and SSIM have no meaningful ratio."""
+    """How a recipe is compared with the first; decibels and SSIM have no meaningful ratio."""
 
 
 METRICS = (
@@ -57,7 +57,7 @@ PER_PHOTOGRAPH = ("psnr", "ssim", "lpips")
 
 
 class Spread(NamedTuple):
-    """What several seeds, or photographs, give."""
+    """Aggregate over several seeds, or photographs."""
 
     mean: float | None
     """None unless every run has a value."""
@@ -100,8 +100,9 @@ class RecipeMetrics(NamedTuple):
     def error_of_difference(self, metric: Metric, first: "RecipeMetrics") -> float | None:
         """Return the standard error of the mean difference to the first recipe, paired by photograph or by run.
 
-        Recipes that are trained with one seed see the same views in the same order; what such a seed does to both is no
-        part of the difference, nor is how hard a photograph is. None of a single pair, or where a value lacks.
+        Recipes that are trained with one seed see the same views in the same order; the effect of such a seed on both
+        is no part of the difference, nor is the difficulty of a photograph. None of a single pair, or where a value
+        lacks.
         """
         pairs = zip(self._values_of(metric), first._values_of(metric), strict=True)
         differences = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
@@ -189,7 +190,7 @@ def first_to_reach(curve: Sequence[Mapping[str, Any]], psnr: float) -> Mapping[s
 
 
 def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[float | None, float | None]:
-    """Return what model, gradients and moments take at most before iteration ``end``, and from it on, MB.
+    """Return the peak memory of model, gradients and moments before iteration ``end``, and from it on, MB.
 
     None for a stage without records.
     """
@@ -205,7 +206,7 @@ def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[floa
 def densification_end(recipe: Mapping[str, Any]) -> float:
     """Return the iteration at which a recipe, as config.json describes it, has stopped cloning and splitting.
 
-    Mini-Splatting simplifies in this iteration; 3DGS continues with what it has. Infinite where there is no such end.
+    Mini-Splatting simplifies in this iteration; 3DGS continues with its Gaussians. Infinite where there is no such end.
     """
     events = [event for event in recipe["events"] if event["action"] == "clone_and_split"]
     stops = [math.inf if event["stop"] is None else event["stop"] * Fraction(event["factor"]) for event in events]

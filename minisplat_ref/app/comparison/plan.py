@@ -1,4 +1,4 @@
-"""Which recipe is trained with which seed, where, and for how long; and how ``plan.json`` holds it."""
+"""The plan of a comparison, kept in ``plan.json``: which recipe is trained with which seed, where, and for how long."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from minisplat_ref.metrics.lpips import check_views, load_network
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
 
-PLAN = "plan.json"  # what `--resume` continues from
+PLAN = "plan.json"  # the state that `--resume` continues
 PATHS = ("scene", "lpips_weights", "init")  # of a plan
 POINTS_PER_RUN = 24  # of each curve: enough to see when a quality is reached, and where it falls again
 
@@ -48,9 +48,9 @@ class Plan(NamedTuple):
     scene: Path
     """Folder or file of the scene, as it was given."""
     folder: Path
-    """Where everything goes; empty or new."""
+    """The output folder; empty or new."""
     recipes: tuple[str, ...]
-    """Names; the first is what the others are compared with."""
+    """Names; the others are compared with the first."""
     iterations: tuple[int, ...]
     """Length of the training, per recipe."""
     seeds: tuple[int, ...]
@@ -64,7 +64,7 @@ class Plan(NamedTuple):
     budget: int | None
     """Gaussians that the recipes with a simplification keep; None for their own choice."""
     simplify: str | None
-    """How the recipes with a simplification choose; None for their own way."""
+    """The choice of Gaussians in recipes with a simplification; None for their own way."""
     scene_type: str | None
     """``indoor`` or ``outdoor``, for the recipes that weigh importance; None for their own choice."""
     lpips_weights: Path | None = None
@@ -118,7 +118,7 @@ def check_free(folder: Path) -> None:
     Raises
     ------
     InputError
-        As for :func:`run_folder.check_free`; of a comparison it says how to continue it.
+        As for :func:`run_folder.check_free`; for a comparison it explains how to continue it.
     """
     if (folder / PLAN).exists():
         raise InputError(
@@ -128,14 +128,14 @@ def check_free(folder: Path) -> None:
 
 
 def check(plan: Plan) -> Scene:
-    """Refuse what could not be carried out, before anything is written; return the scene.
+    """Refuse a plan that cannot be carried out, before anything is written; return the scene.
 
     Raises
     ------
     InputError
         A recipe is unknown or named twice, there is no length for each, no recipe takes an option, the scene cannot be
         loaded, has no test views or too few to train on, or fewer photographs than folds, or the weights of LPIPS or
-        the points to start from are not what they should be.
+        the points to start from are damaged.
     """
     for name, values in (("--recipes", plan.recipes), ("--seeds", plan.seeds)):
         _refuse_repetition(name, values)
@@ -190,14 +190,14 @@ def save_plan(plan: Plan) -> None:
 
 
 def remove_if_unused(folder: Path) -> None:
-    """Take back the folder of a comparison whose first training was refused: there is nothing to continue."""
+    """Remove the folder of a comparison whose first training was refused: there is nothing to continue."""
     if [path.name for path in folder.iterdir()] == [PLAN]:
         (folder / PLAN).unlink()
         folder.rmdir()
 
 
 def load_plan(folder: Path) -> Plan:
-    """Read what :func:`save_plan` wrote.
+    """Read a file of :func:`save_plan`.
 
     Raises
     ------

@@ -47,7 +47,7 @@ never acted here, or acted late, is not what this comparison measures."""
 
 
 def notes(plan: Plan, results: Results) -> list[str]:
-    """Return what a reader of the table has to know."""
+    """Return the notes for a reader of the table."""
     first = plan.recipes[0]
     seeds = ", ".join(map(str, plan.seeds))
     values = f"Mean and standard deviation of seeds {seeds}" if len(plan.seeds) > 1 else f"Seed {seeds}"

@@ -1,4 +1,4 @@
-"""What a comparison has found, from its finished runs, and how compare.json holds it."""
+"""The results of a comparison, from its finished runs, and their form in compare.json."""
 
 import platform
 from collections.abc import Sequence
@@ -35,15 +35,15 @@ class Results(NamedTuple):
     curves: dict[str, list[list[dict[str, Any]]]]
     """For every recipe the records of ``curve.jsonl`` of each run."""
     fired: Sequence[Fired]
-    """Which mechanisms acted, in the order of the plan."""
+    """The mechanisms that acted, in the order of the plan."""
     crops: Sequence[Crop]
     """Parts of test views, rendered with the first run of each recipe."""
     lpips_reason: str | None
-    """Why LPIPS is missing."""
+    """The reason why LPIPS is missing."""
     lpips_network: str | None
     """By which network LPIPS was measured."""
     machine: str
-    """What times and memory depend on."""
+    """Machine and versions, on which times and memory depend."""
 
 
 def collect(plan: Plan, scene: Scene) -> Results:
@@ -84,7 +84,7 @@ def collect(plan: Plan, scene: Scene) -> Results:
 
 
 def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
-    """Return what compare.json holds."""
+    """Return the content of compare.json."""
     camera = scene.test_views[0].camera
     return {
         "settings": {
@@ -114,7 +114,7 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
 
 
 def read_fired(plan: Plan) -> list[Fired]:
-    """Return what fired in the finished runs of a plan, recipe by recipe."""
+    """Return the mechanisms that fired in the finished runs of a plan, recipe by recipe."""
     found = []
     for name, iterations in zip(plan.recipes, plan.iterations, strict=True):
         recipe = find_recipe(name)

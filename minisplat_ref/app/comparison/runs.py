@@ -24,21 +24,21 @@ WARM_UP_VIEWS = 4
 
 
 def warm_up(plan: Plan, scene: Scene) -> None:
-    """Train every recipe for a moment: no run's clock is to count compiling what the next run finds compiled."""
+    """Train every recipe for a moment, so that the clock of no run includes compilation that the next run is spared."""
     scene = scene._replace(train_views=scene.train_views[:WARM_UP_VIEWS])
     for recipe in plan.recipes:
-        # So short a schedule may ask for what cannot be; a fault of the recipe itself shows in its own run.
+        # So short a schedule may be impossible; a fault of the recipe itself appears in its own run.
         with contextlib.suppress(InputError):
             train(scene, find_recipe(recipe, WARM_UP), seed=0)
 
 
 def statuses(plan: Plan) -> list[Status]:
-    """Return how far each of the plan's trainings has come.
+    """Return the status of each of the plan's trainings.
 
     Raises
     ------
     InputError
-        In the place of a run folder is a run of other settings, or something else.
+        Instead of a run folder there is a run with other settings, or something else.
     """
     return [status_of(run.folder, settings_of(plan, run)) for run in plan.runs]
 
@@ -60,7 +60,7 @@ def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
     Raises
     ------
     KeyboardInterrupt
-        After Ctrl-C or SIGTERM, when the running training has saved what there is.
+        After Ctrl-C or SIGTERM, when the running training has saved its state.
     CalledProcessError
         A training has been killed or has a programming error.
     """
@@ -105,9 +105,9 @@ def stored_words(folder: Path, number: int) -> list[str] | None:
 
 
 def next_words(plan: Plan, number: int) -> list[str] | None:
-    """Return the command that takes a training from where it is to its end, as words; None if it has ended.
+    """Return the command that completes a training, as words; None if it has ended.
 
-    What is left of a training without a checkpoint is removed.
+    Files of a training without a checkpoint are removed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How fast models are rendered: interleaved in one process, so that all of them meet the same machine."""
+"""Rendering speed of models, measured alternately in one process, so that the machine's state is the same for all."""
 
 import statistics
 import time

@@ -8,7 +8,7 @@ NOT_REACHED = "not reached"
 
 
 def table_cells(recipes: Sequence[RecipeMetrics]) -> list[list[str]]:
-    """Return the table: the heading, then a row per metric, each beginning with what it is."""
+    """Return the table: the heading, then a row per metric, each beginning with its name."""
     heading = ["", *(recipe.recipe for recipe in recipes)]
     return [heading, *([metric.title, *_row(metric, recipes)] for metric in METRICS if _is_known(metric, recipes))]
 

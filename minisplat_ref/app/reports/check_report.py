@@ -1,4 +1,4 @@
-"""The page of a check: what the oracle or a measurement reports, as ``report.html``."""
+"""The page of a check: the report of the oracle or of a measurement, as ``report.html``."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -57,7 +57,7 @@ def _tables(groups: Iterable[Sequence[Case]]) -> list[str]:
 
 
 def _settings(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return what can be said in a line of each; lists of records are in the JSON file."""
+    """Return the entries of one line each; lists of records are in the JSON file."""
     simple = [
         (name.replace("_", " ").capitalize(), _in_words(value))
         for name, value in settings.items()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def program() -> str:
-    """Return how the program is called from anywhere: by its name, or through the interpreter that runs it now."""
+    """Return the words that call the program from anywhere: its name, or the interpreter that runs it now."""
     if shutil.which("minisplat-ref") is not None:
         return "minisplat-ref"
     call = f"{_quote(sys.executable)} -m minisplat_ref"

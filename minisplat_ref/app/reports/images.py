@@ -1,4 +1,4 @@
-"""Images for a person to look at: renders beside photographs, errors and depths in colour."""
+"""Images for inspection: renders beside photographs, errors and depths in colour."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ def depth_image(depth: Floats, near: float, far: float) -> Image8:
 
 
 def depth_range(depth: Floats) -> tuple[float, float]:
-    """Near and far end for :func:`depth_image`: the 1st and 99th percentile of what is seen."""
+    """Near and far end for :func:`depth_image`: the 1st and 99th percentile of the visible depths."""
     seen = depth[depth > 0]
     if seen.size == 0:
         return 0.0, 1.0

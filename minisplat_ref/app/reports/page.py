@@ -1,8 +1,8 @@
-"""The one look of all reports: an HTML file with images, curves and tables, and nothing that it loads from elsewhere.
+"""The common layout of all reports: a self-contained HTML file with images, curves and tables.
 
 Images are in the page in base64, curves are inline SVG (:mod:`minisplat_ref.app.reports.plots`), and so are the style
-sheet and the few lines of script (:mod:`minisplat_ref.app.reports.page_style`), without which nothing is missing: a
-slider is then two images beside each other. The page tells the browser to load nothing else.
+sheet and the few lines of script (:mod:`minisplat_ref.app.reports.page_style`), which are optional: without them a
+slider is two images side by side. The page tells the browser to load nothing else.
 """
 
 import base64
@@ -19,7 +19,7 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-s
 BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
 GOOD = {"passed", "agrees"}
 LONG = 44  # characters of a cell that may break into lines
-N_COLUMNS = 4  # of a table that fits on a phone; in one with more, or with a long cell, cells stand below each other
+N_COLUMNS = 4  # of a table that fits on a phone; in one with more, or with a long cell, cells are below each other
 TALL = 60  # rows of a table that scrolls in the page instead of making it long
 PNG_PIXELS = 1 << 17  # of larger images a PNG would make the page heavy
 JPEG_QUALITY = 92
@@ -35,7 +35,7 @@ def page(title: str, introduction: str, parts: Iterable[str]) -> str:
     introduction : str
         One or two sentences under it.
     parts : iterable of str
-        HTML: what the functions below return.
+        HTML, from the functions below.
     """
     # Names of files that are not text in the file system's encoding cannot be written; they are shown with escapes.
     parts = [part.encode("utf-8", "backslashreplace").decode() for part in parts]
@@ -79,7 +79,7 @@ def paragraph(text: str) -> str:
 
 
 def link(text: str, target: str) -> str:
-    """Return a line that leads to a file beside the page."""
+    """Return a line with a link to a file beside the page."""
     return f'<p><a href="{escape(target)}">{escape(text)}</a></p>'
 
 
@@ -94,7 +94,7 @@ def code(text: str) -> str:
 
 
 def cards(figures: Iterable[tuple[str, str]]) -> str:
-    """Return key figures, each a value with its unit and what it is."""
+    """Return key figures, each a value with its unit and its meaning."""
     boxes = (
         f'<div class="card"><b>{escape(value)}</b><span>{escape(meaning)}</span></div>' for value, meaning in figures
     )
@@ -104,7 +104,7 @@ def cards(figures: Iterable[tuple[str, str]]) -> str:
 def table(rows: Iterable[Sequence[str]], heading: Sequence[str] = ()) -> str:
     """Return a panel with a table whose first column names the rows; a wide one scrolls under that column.
 
-    On a phone the cells of a wide row stand below each other, each behind its heading.
+    On a phone the cells of a wide row are below each other, each behind its heading.
     """
     rows = [tuple(row) for row in rows]
     head = f"<thead><tr>{''.join(map(_heading_cell, heading))}</tr></thead>" if heading else ""
@@ -139,7 +139,7 @@ def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
 
 
 def grid(panels: Sequence[str], *, is_smooth: bool = True) -> str:
-    """Return panels two beside each other; images that are not smoothed show their pixels."""
+    """Return panels in pairs side by side; images that are not smoothed show their pixels."""
     kind = "row" if is_smooth else "row pixels"
     return f'<div class="{kind}" style="--columns: 2">{"".join(panels)}</div>'
 

@@ -34,7 +34,7 @@ PLOT_STYLE: dict[Any, Any] = {
 
 @contextmanager
 def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> Iterator[tuple[Figure, Axes]]:
-    """Give a new figure and its axes to draw on.
+    """Return a new figure and its axes.
 
     Parameters
     ----------

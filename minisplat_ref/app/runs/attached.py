@@ -1,8 +1,8 @@
 """Run a module in a process that ends with the one that started it: ``-m`` of a worker's children.
 
 A worker that is killed closes the pipe that is the standard input here. The command must not continue then: another
-worker takes its task over, and both would write into one folder. It ends at once, like the worker itself, and what
-continues from its last checkpoint has the bytes of a run in one piece.
+worker takes its task over, and both would write into one folder. It ends at once, like the worker itself, and a
+training that continues from its last checkpoint has the bytes of a run in one piece.
 """
 
 import os
@@ -10,7 +10,7 @@ import runpy
 import sys
 import threading
 
-ORPHANED = 1  # exit code that nobody is left to read
+ORPHANED = 1  # exit code that no process reads
 
 
 def _end_with_parent() -> None:

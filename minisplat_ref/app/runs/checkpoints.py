@@ -1,6 +1,6 @@
-"""The checkpoints of a run: when they are written, which one counts, and the model that is in it.
+"""The checkpoints of a run: their schedule, the choice of the newest whole one, and the model in it.
 
-The last two are kept. One that is damaged, by a disk that lied or a person, is passed over with a line that says so.
+The last two are kept. One that is damaged, by a faulty disk or a person, is skipped with a line about it.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ def save(folder: Path, state: TrainState, recipe: Recipe) -> None:
 
 
 def save_regularly(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
-    """Return a callback of the loop that saves every SECONDS, and before what may find no room in memory."""
+    """Return a callback of the loop that saves every SECONDS, and before an iteration that may run out of memory."""
     last_saved = time.monotonic()
 
     def on_step(report: StepReport) -> None:
@@ -46,7 +46,7 @@ def save_regularly(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]
 
 
 def _may_burst(report: StepReport, recipe: Recipe) -> bool:
-    """Return whether rows may be added in the next iteration, and there is no room for twice as many."""
+    """Return whether rows may be added in the next iteration while memory has no room for twice as many."""
     if not any(isinstance(event, DatedEvent) and event.is_due(report.step + 1) for event in recipe.events):
         return False
     n = report.n_gaussians
@@ -54,7 +54,7 @@ def _may_burst(report: StepReport, recipe: Recipe) -> bool:
 
 
 def newest(folder: Path, read: Callable[[Path], Content]) -> Content:
-    """Return what ``read`` makes of the newest checkpoint that is whole.
+    """Return the result of ``read`` for the newest checkpoint that is whole.
 
     Raises
     ------

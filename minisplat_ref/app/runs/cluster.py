@@ -1,6 +1,6 @@
 """Many commands at once, by processes on this machine or by a Dask cluster: connect, check, hand out, wait.
 
-``--workers N`` starts N processes here, ``--cluster ADDRESS`` goes to a scheduler that somebody else has started; both
+``--workers N`` starts N processes here, ``--cluster ADDRESS`` connects to a scheduler that is already running; both
 are ``dask.distributed``, of the extra ``cluster``. A job is a command that writes into a folder from which it can
 continue. So nothing is lost when a worker is killed: the scheduler hands its job to another one.
 """
@@ -34,11 +34,11 @@ CONNECT_SECONDS = 10.0  # for the scheduler to answer
 WORKER_SECONDS = 60.0  # for a first worker to come; of a batch system they come late
 SAVING_SECONDS = 120.0  # after Ctrl-C, for the running commands to save
 TOKEN = ".workers-"  # begins the name of a token
-REPORTED_CODES = (2, INTERRUPTED)  # after which the command has said in a line all there is to say
+REPORTED_CODES = (2, INTERRUPTED)  # after which the command has printed its line of explanation
 
 
 class Workers(NamedTuple):
-    """Who carries jobs out; by default this process, one job after the other."""
+    """The processes that carry jobs out; by default this one, one job after the other."""
 
     n: int = 0
     """Processes on this machine."""
@@ -82,7 +82,7 @@ def carry_out_all(
         dask.distributed is not installed, no scheduler answers, there are no workers, one has another version or does
         not see a path, the scheduler is lost, or a job has cost the lives of several workers.
     RuntimeError
-        A command has failed without saying in a line why: a programming error.
+        A command has failed without its line of explanation: a programming error.
     KeyboardInterrupt
         After Ctrl-C, when the running commands have saved.
     """
@@ -103,7 +103,7 @@ def carry_out_all(
 
 
 def _last_line(said: str) -> str:
-    """Return the line in which a command says why it ended."""
+    """Return the line in which a command gives the reason for its end."""
     lines = [line for line in said.splitlines() if line.strip()]
     return next((line for line in reversed(lines) if line.startswith("minisplat-ref: ")), "".join(lines[-1:]))
 
@@ -130,8 +130,8 @@ def _outcomes(client: Any, jobs: Sequence[Job], site: Site, on_done: Callable[[J
             "the connection to the scheduler is lost: what has been finished is kept; start a scheduler and continue"
         ) from error
     except KeyboardInterrupt:
-        site.token.unlink(missing_ok=True)  # which tells the workers
-        with contextlib.suppress(Exception):  # whoever is lost now loses what came after the last checkpoint
+        site.token.unlink(missing_ok=True)  # which notifies the workers
+        with contextlib.suppress(Exception):  # a worker that is lost now loses its work since the last checkpoint
             wait(list(futures), timeout=SAVING_SECONDS)
         raise
     if killed:
@@ -153,12 +153,12 @@ def _client(workers: Workers) -> Iterator[Any]:
         stack.enter_context(warnings.catch_warnings())
         warnings.filterwarnings("ignore", module="distributed")  # of ports in use, and of other versions of Dask
         if workers.address is None:
-            with _deaf_to_ctrl_c():  # a terminal's Ctrl-C reaches all processes; here the token tells the workers
+            with _deaf_to_ctrl_c():  # a terminal's Ctrl-C reaches all processes; here the token stops the workers
                 cluster = distributed.LocalCluster(
                     n_workers=workers.n,
                     threads_per_worker=1,
                     dashboard_address=None,
-                    memory_limit=0,  # the commands are other processes, which foresee what memory they take
+                    memory_limit=0,  # the commands are other processes, which check their memory beforehand
                     silence_logs="CRITICAL",
                 )
             stack.enter_context(cluster)
@@ -174,7 +174,7 @@ def _connect(address: str) -> Any:
 
     import distributed
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it tells of lost connections is told here
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # ours replace its messages of lost connections
     try:
         client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
@@ -204,7 +204,7 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _token(folder: Path) -> Iterator[Path]:
-    """Make the file that says that somebody waits for results in a folder; those that killed programs left go."""
+    """Make the file that marks results in a folder as awaited; remove those that killed programs left."""
     folder = folder.resolve()
     with hold_folder(folder):  # another program that waits for results here
         for left in folder.glob(f"{TOKEN}*"):

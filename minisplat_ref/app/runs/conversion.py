@@ -1,7 +1,7 @@
 """Models from any file, and the choice of a precision: the finest that fits, or the coarsest that is good enough.
 
-What is lost by a compact file is measured on photographs that were *trained* on, at most 24 of them: the choice of a
-level is a decision like others, and the test views stay out of it.
+The loss by a compact file is measured on photographs that were *trained* on, at most 24 of them: the choice of a level
+is a decision like others, and the test views must not influence it.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from minisplat_ref.training.sky import with_sky
 from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, number_views
 
 VIEWS_MAX = 24
-NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
+NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are blended; 2e-7 has been seen
 
 
 class Source(NamedTuple):
@@ -39,7 +39,7 @@ class Source(NamedTuple):
     frame: Frame = FILE_FRAME
     """The frame in which it is rendered."""
     label: Label = NO_LABEL
-    """What a file of its population is to say about how it is drawn."""
+    """The label for a file of its population."""
 
 
 class Choice(NamedTuple):
@@ -58,7 +58,7 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     ----------
     path : Path
     extension : str, optional
-        That draws a file, in place of what it says; runs and checkpoints know theirs.
+        The one that renders a file, instead of the one in its label; runs and checkpoints have theirs.
 
     Raises
     ------
@@ -214,11 +214,11 @@ class Judge(NamedTuple):
 
     psnr_of: Callable[[Gaussians], float]
     views: str
-    """Which, in a few words."""
+    """A description in a few words."""
 
 
 def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | None) -> Judge:
-    """Return what measures a model on training views: of its run, or of a scene.
+    """Return a function that measures a model on training views: of its run, or of a scene.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
-"""How good a training was when: ``curve.jsonl``, a record for each time that the test views were measured.
+"""Quality over the course of a training: ``curve.jsonl`` has a record of each evaluation on the test views.
 
-Where the scene folder holds true depths, a record also has ``chamfer``: see :mod:`.surface`.
+Where the scene folder holds true depths, a record also has ``chamfer``: see
+:mod:`minisplat_ref.datasets.synthetic.surface`.
 """
 
 from pathlib import Path

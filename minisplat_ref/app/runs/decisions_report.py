@@ -1,6 +1,6 @@
-"""What a training without a schedule has decided, for a page: a paragraph, figures with the evidence, and a table.
+"""The decisions of a training without a schedule, for a page: a paragraph, figures with the evidence, and a table.
 
-Of the recipe ``adaptive`` (:mod:`minisplat_ref.training.pace`): at which iteration it did what, and why.
+The recipe is ``adaptive`` (:mod:`minisplat_ref.training.pace`); each decision has its iteration and its reason.
 """
 
 import math
@@ -35,7 +35,7 @@ SLOPE_TEXT = "A red line has the slope by which it was decided that little was l
 
 
 def decisions_section(pace: Pace, n_iterations: int) -> str:
-    """Return the part of a page that says what was decided.
+    """Return the part of a page about the decisions.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def decisions_section(pace: Pace, n_iterations: int) -> str:
 
 
 def story(pace: Pace, n_iterations: int) -> str:
-    """Return what was decided as sentences."""
+    """Return the decisions as sentences."""
     n = len(pace.measurements)
     sentences = []
     if n:
@@ -101,7 +101,7 @@ def _row(decision: Decision) -> list[str]:
 
 
 def over_iterations(pace: Pace) -> Figure:
-    """Draw the PSNR of the held-out views over the iterations, with what was decided."""
+    """Plot the PSNR of the held-out views over the iterations, with the decisions."""
     with plot(PSNR, "iterations", (5.6, 3.6)) as (figure, axes):
         for part in _of_one_size(pace):
             _draw(axes, part, [float(m.step) for m in part])
@@ -113,7 +113,7 @@ def over_iterations(pace: Pace) -> Figure:
 
 
 def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
-    """Write what was decided at the foot of its line; what was decided at nearly one iteration is in one label."""
+    """Write each decision at the foot of its line; decisions of nearly the same iteration share one label."""
     labels: dict[int, list[str]] = {}
     for decision in decisions:
         near = next((step for step in labels if decision.step - step <= 1), decision.step)
@@ -134,7 +134,7 @@ def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
 
 
 def over_work(pace: Pace) -> Figure:
-    """Draw the same over the work, by whose doublings the gain is counted."""
+    """Plot the same over the work; the gain is counted for each doubling of it."""
     with plot(PSNR, "work (pairs of tile and Gaussian)", (5.6, 3.6)) as (figure, axes):
         for part in _of_one_size(pace):
             _draw(axes, part, [float(m.n_pairs) for m in part])

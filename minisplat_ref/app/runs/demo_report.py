@@ -1,4 +1,4 @@
-"""The demo's ``report.html``: images of held-out views, depth beside the true depth, curves, and what to try next."""
+"""The demo's ``report.html``: images of held-out views, depth beside the true depth, curves, and the next steps."""
 
 import os
 import platform
@@ -59,7 +59,7 @@ class ViewImages(NamedTuple):
     name: str
     """Name of the view."""
     caption: str
-    """What was measured on it."""
+    """The metrics measured on it."""
     truth: Image8
     """[H, W, 3] photograph, sRGB."""
     render: Image8

@@ -1,4 +1,4 @@
-"""What a trained run shows of its surface from a camera: a depth of one of three kinds, and the colours."""
+"""Maps of a trained run's surface from a camera: a depth of one of three kinds, and the colours."""
 
 from enum import Enum
 
@@ -14,14 +14,14 @@ ALPHA_MIN = 0.5  # of a pixel that shows a surface: more of its light comes from
 
 
 class DepthKind(Enum):
-    """Which depth of a pixel is taken for that of the surface."""
+    """The kind of a pixel's depth that is taken for that of the surface."""
 
     MEDIAN = "median"
     """Of the hit at which the transmittance falls to a half."""
     EXPECTED = "expected"
     """The mean of all hits."""
     MIDPOINT = "midpoint"
-    """Where the ray is nearest to the middle of the dominant Gaussian (Mini-Splatting)."""
+    """The point of the ray that is nearest to the middle of the dominant Gaussian (Mini-Splatting)."""
 
 
 WANTS = {DepthKind.MEDIAN: "median_depth", DepthKind.EXPECTED: "depth", DepthKind.MIDPOINT: "surface"}

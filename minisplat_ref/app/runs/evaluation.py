@@ -1,7 +1,7 @@
 """Measuring a run again, later: where the measures go, so that those of one thing never replace those of another.
 
-``metrics.json`` and ``renders/`` of a run are of its result on its own test views. Anything else has a folder of its
-own: another split of the same photographs, a run that has not ended, and other photographs where they are asked for.
+``metrics.json`` and ``renders/`` of a run are of its result on its own test views. Anything else has a separate folder:
+another split of the same photographs, a run that has not ended, and other photographs on request.
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ class Measured(NamedTuple):
     evaluation: Evaluation
     folder: Path
     notes: list[str]
-    """What a reader of the measures must know, a line each."""
+    """Notes for a reader of the metrics, a line each."""
 
 
 def evaluate_run(
@@ -126,7 +126,7 @@ def _metrics_of(folder: Path) -> dict[str, Any]:
 
 
 def _about(folder: Path, asked: Settings, unfinished: int | None, notes: list[str]) -> dict[str, Any]:
-    """Say for metrics in a separate folder what was measured."""
+    """Describe the measured views, for metrics in a separate folder."""
     iterations = _metrics_of(folder).get("iterations") if unfinished is None else unfinished
     return {
         "run": str(folder.resolve()),
@@ -138,7 +138,7 @@ def _about(folder: Path, asked: Settings, unfinished: int | None, notes: list[st
 
 
 def _describe_training_views(entries: fingerprint.Entries, scene: Scene) -> list[str]:
-    """Say how many of the measured views the run was trained on."""
+    """Report how many of the measured views the run was trained on."""
     names = fingerprint.trained_on(entries)
     n_known = sum(view.name in names for view in scene.test_views)
     if not n_known:

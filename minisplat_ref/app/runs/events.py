@@ -1,7 +1,8 @@
-"""What fired in a training, and when: ``events.jsonl``, and what it says of each mechanism of the recipe.
+"""The events of a training: ``events.jsonl`` records which mechanisms of the recipe fired, and when.
 
 A mechanism is an action that the recipe has at some iterations, not at every one: densification, pruning, a reset. In
-short or small runs some never act. Nothing can be said of a mechanism from a run in which it was off, so it is named.
+short or small runs some never act. A run says nothing about a mechanism that never acted in it, so such mechanisms are
+named.
 """
 
 from collections import Counter
@@ -21,13 +22,13 @@ Records = Sequence[Mapping[str, Any]]
 
 
 class Mechanism(NamedTuple):
-    """What one action has done in a run, all its events together."""
+    """The effect of one action in a run, all its events together."""
 
     action: str
     times: int
-    """How often it has acted."""
+    """Number of times that it has acted."""
     published: int
-    """How often it acts in the recipe as published."""
+    """Number of times that it acts in the recipe as published."""
     first: int
     """Iteration at which it acted first."""
     last: int
@@ -43,7 +44,7 @@ class Mechanism(NamedTuple):
     seconds: float
     """Taken by all times together."""
     notes: Mapping[str, int]
-    """What the action has noted, and how often."""
+    """Notes of the action, and the number of times of each."""
 
 
 def append(path: Path, step: int, fired: Iterable[FiredEvent]) -> None:
@@ -53,7 +54,7 @@ def append(path: Path, step: int, fired: Iterable[FiredEvent]) -> None:
 
 
 def count_published_times(recipe: Recipe) -> dict[str, int]:
-    """Return how often each mechanism of a recipe acts, by the name of its action; smaller views count once."""
+    """Return how many times each mechanism of a recipe acts, by the name of its action; smaller views count once."""
     times: Counter[str] = Counter()
     for event in recipe.events:
         n_steps = sum(event.is_due(step) for step in range(1, recipe.iterations + 1))
@@ -65,7 +66,7 @@ def count_published_times(recipe: Recipe) -> dict[str, int]:
 
 
 def read_mechanisms(path: Path, published: Mapping[str, int]) -> list[Mechanism]:
-    """Return what the mechanisms of a run have done; see :func:`mechanisms`.
+    """Return the actions of a run's mechanisms; see :func:`mechanisms`.
 
     Raises
     ------
@@ -81,7 +82,7 @@ def read_mechanisms(path: Path, published: Mapping[str, int]) -> list[Mechanism]
 
 
 def mechanisms(records: Records, published: Mapping[str, int]) -> list[Mechanism]:
-    """Return what each action has done, in the order in which they first acted.
+    """Return the effect of each action, in the order in which they first acted.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def never_fired(found: Iterable[Mechanism], published: Iterable[str]) -> list[st
 
 
 def describe(mechanism: Mechanism) -> str:
-    """Return in a line what a mechanism has done; of many notes, the first and the last."""
+    """Return a line about the actions of a mechanism; of many notes, the first and the last."""
     m = mechanism
     times, steps = "once", f"at {m.first:,}"
     change = f"{m.n_before:,} -> {m.n_after:,} Gaussians"

@@ -1,11 +1,10 @@
-"""Which scene a run belongs to: the cameras and photographs of its views, as ``cameras.json`` keeps them.
+"""The fingerprint of a run's scene: the cameras and photographs of its views, as ``cameras.json`` keeps them.
 
-Hashed are the pixels as they were loaded (downscaled, undistorted, composited, with their mask), not the files: they
-are what was trained on. A photograph that is saved again without loss, or a scene that is converted from COLMAP to
+Hashed are the pixels as they were loaded (downscaled, undistorted, composited, with their mask), not the files: the
+training used these pixels. A photograph that is saved again without loss, or a scene that is converted from COLMAP to
 transforms.json, is the same; another ``--downscale`` is not. It takes as long as reading the pixels once: from memory,
-or from disk where memory cannot hold them.
-A decoder that gives other pixels for the same JPEG makes another scene, and a training continued on it would indeed not
-end with the same bytes.
+or from disk where memory cannot hold them. A decoder that gives other pixels for the same JPEG makes another scene, and
+a training continued on it would indeed not end with the same bytes.
 
 Cameras are compared to nine digits: a product of matrices can differ in the last one between machines.
 """
@@ -35,7 +34,7 @@ Entries = Sequence[Mapping[str, Any]]
 
 
 def of_scene(scene: Scene) -> list[dict[str, Any]]:
-    """Return what ``cameras.json`` holds: every view with its camera, as in the files, and its photograph's hash."""
+    """Return the content of ``cameras.json``: every view with its camera, as in the files, and a photograph's hash."""
     views = (*scene.train_views, *scene.test_views)
     found = viewpoints.scene_viewpoints(scene)
     cameras = viewpoints.to_json([v._replace(camera=return_camera(v.camera, scene.frame)) for v in found])
@@ -64,7 +63,7 @@ def _hash_of_pixels(view: View) -> str:
 
 
 def read(folder: Path) -> Entries | None:
-    """Return the views that a run was trained on; None where the folder does not say.
+    """Return the views that a run was trained on; None where the folder does not have it.
 
     Raises
     ------
@@ -80,7 +79,7 @@ def read(folder: Path) -> Entries | None:
 
 
 def difference(entries: Entries, others: Entries) -> str:
-    """Say what differs between the views of a run and those of a scene; nothing where they are the same.
+    """Describe the differences between the views of a run and those of a scene; nothing where they are the same.
 
     Whether a view is one for training or for testing does not matter here; see :func:`is_split_alike`.
 
@@ -145,7 +144,7 @@ def trained_on(entries: Entries) -> set[str]:
 
 
 def warn_of_unchecked(folder: Path, entries: Entries | None) -> None:
-    """Warn of what cannot be compared of a run that an older version made."""
+    """Warn about parts of a run of an older version that cannot be compared."""
     if entries is None:
         message = f"{folder} has no {CAMERAS}: whether the scene is its own cannot be checked"
     elif not all(PHOTOGRAPH in entry for entry in entries):
@@ -170,7 +169,7 @@ def check(folder: Path, scene: Scene, source: str) -> None:
     Raises
     ------
     InputError
-        Says what differs.
+        Names the difference.
     """
     entries = read(folder)
     if entries is not None:

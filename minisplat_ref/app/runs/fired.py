@@ -1,4 +1,4 @@
-"""Which mechanisms of a recipe acted in its runs, and which never did."""
+"""The mechanisms of a recipe that acted in its runs, and those that never did."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -9,7 +9,7 @@ HEADING = ("mechanism", "times", "published", "first step", "last step", "added"
 
 
 class Fired(NamedTuple):
-    """What a recipe has done, in all its runs."""
+    """The actions of a recipe, in all its runs."""
 
     recipe: str
     iterations: int
@@ -17,9 +17,9 @@ class Fired(NamedTuple):
     published_iterations: int
     """Of the recipe as published."""
     published: dict[str, int]
-    """How often each mechanism acts in the recipe as published."""
+    """Number of times that each mechanism acts in the recipe as published."""
     runs: Sequence[Sequence[Mechanism]]
-    """Per run, what its mechanisms have done."""
+    """Per run, the actions of its mechanisms."""
 
     @property
     def never(self) -> list[str]:
@@ -48,7 +48,7 @@ def rows(fired: Fired) -> list[list[str]]:
 
 
 def remarks(fired: Fired) -> list[str]:
-    """Return what the table does not say: notes of the mechanisms, and those that never acted."""
+    """Return what the table lacks: notes of the mechanisms, and those that never acted."""
     return [f"{name}: {note}" for name, notes in _notes(fired).items() for note in notes]
 
 

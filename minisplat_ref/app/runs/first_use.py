@@ -27,7 +27,7 @@ def warn_if_not_kept(backend: str) -> None:
 
 
 def compile_kernels(backend: str) -> None:
-    """Compile what an iteration needs if nothing is on disk yet; otherwise what lacks is compiled when it is used.
+    """Compile the kernels of an iteration if none are on disk yet; otherwise missing ones are compiled on use.
 
     Parameters
     ----------

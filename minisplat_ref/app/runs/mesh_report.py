@@ -1,4 +1,4 @@
-"""The page that ``mesh`` writes beside a mesh: the mesh from four sides, beside what the run shows there."""
+"""The page that ``mesh`` writes beside a mesh: the mesh from four sides, beside renders of the run."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
 """``mesh``: the surface of a run, fused from the depths that its training cameras show (after KinectFusion and 2DGS).
 
-The cameras render the run; photographs are not needed. A first pass over them finds where the surface lies, which says
-how large the grid has to be; a second fuses the depths (:mod:`minisplat_ref.mechanisms.fusion`).
+The cameras render the run; photographs are not needed. A first pass over them locates the surface, which determines the
+size of the grid; a second fuses the depths (:mod:`minisplat_ref.mechanisms.fusion`).
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ POINTS_PER_VIEW = 4_000  # in the first pass
 
 
 class Asked(NamedTuple):
-    """What the command line says."""
+    """The options of the command line."""
 
     run: Path
     depth: DepthKind = DepthKind.MEDIAN
@@ -48,7 +48,7 @@ class Asked(NamedTuple):
 
 
 class Meshed(NamedTuple):
-    """The surface, in the frame of the run's files, and how it was found."""
+    """The surface, in the frame of the run's files, and the settings of its extraction."""
 
     mesh: ColoredMesh
     voxel: float
@@ -67,7 +67,7 @@ class Opened(NamedTuple):
     frame: Frame
 
     def map_of(self, view: Viewpoint, kind: DepthKind) -> DepthMap:
-        """Return what a camera shows."""
+        """Return the image and the depth map of a camera."""
         return depth_map(self.trained, view_from(view.camera, time=view.time), kind)
 
     def camera_of(self, view: Viewpoint) -> Camera:
@@ -145,7 +145,7 @@ def _find_surface(opened: Opened, kind: DepthKind) -> _Places:
 def _choose_grid(opened: Opened, places: _Places, asked: Asked) -> Grid:
     """Return the grid: voxels as large as the pixels of the surface, or as many as ``N_VOXELS_MAX``.
 
-    Without bounds, what lies nearer to the point on which the cameras look than the nearest camera is not contracted.
+    Without bounds, the space nearer to the point that the cameras face than the nearest camera is not contracted.
     """
     footprint = float(np.median(places.footprints))
     given = None if asked.voxel is None else asked.voxel / opened.frame.unit

@@ -1,4 +1,4 @@
-"""A model's file: who draws it, as its label says, and what it lacks of its run."""
+"""A model's file: the extension that renders it, from its label, and the parts of its run that it lacks."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ from minisplat_ref.training.sky import SKY
 from minisplat_ref.types import Gaussians
 
 PARTS = {SKY: "the sky", COMPENSATION: "the compensation of opacities"}
-"""What every view shows of a model and no file of Gaussians holds, by the names of its shared parameters."""
+"""Parts of a model that every view shows and no file of Gaussians holds, by the names of its shared parameters."""
 
 
 class ModelFile(NamedTuple):
@@ -25,9 +25,9 @@ class ModelFile(NamedTuple):
 
     population: Any
     owner: Extension
-    """Whose population it is, and who draws it, with the settings that the file has."""
+    """The extension of the population and its renderer, with the file's settings."""
     label: Label
-    """What another file of it is to say."""
+    """The label for another file of it."""
 
 
 def missing_parts(shared: Iterable[str]) -> tuple[str, ...]:
@@ -36,12 +36,12 @@ def missing_parts(shared: Iterable[str]) -> tuple[str, ...]:
 
 
 def describe_parts(names: Iterable[str]) -> str:
-    """Return parts of a model in a few words; those that only another version knows by their names."""
+    """Return parts of a model in a few words; parts that only another version has, by their names."""
     return " and ".join(PARTS.get(name, name) for name in names)
 
 
 def label_for(owner: Extension, shared: Iterable[str], settings: Mapping[str, str]) -> Label:
-    """Return what a file is to say that holds the population of a run.
+    """Return the label for a file with the population of a run.
 
     Parameters
     ----------
@@ -57,19 +57,19 @@ def label_for(owner: Extension, shared: Iterable[str], settings: Mapping[str, st
 
 
 def label_of(path: Path) -> Label:
-    """Return what a PLY or a compact file says about how it is drawn.
+    """Return the label of a PLY or a compact file.
 
     Raises
     ------
     InputError
-        The file, or what it says, cannot be read.
+        The file, or its label, cannot be read.
     """
     format_ = find_format(path)
     return read_label(path) if format_ is None else formats.label_of(path, format_, formats.read_content(path))
 
 
 def recorded_owner(path: Path, label: Label) -> Extension:
-    """Return the extension that a file says it is drawn by; ``CORE`` if it says nothing.
+    """Return the extension that is recorded in a file; ``CORE`` if there is none.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def recorded_owner(path: Path, label: Label) -> Extension:
 
 
 def _configured(path: Path, owner: Extension, label: Label) -> Extension:
-    """Return an extension that draws with the settings of a label."""
+    """Return an extension that renders with the settings of a label."""
     try:
         renderer = configure_renderer(owner.representation.renderer, label.set)
     except InputError as error:
@@ -97,10 +97,10 @@ def _configured(path: Path, owner: Extension, label: Label) -> Extension:
 
 
 def choose_owner(path: Path, label: Label, given: Extension | None, why: str) -> Extension:
-    """Return who draws a file: what the user names, and else what the file says.
+    """Return the extension that renders a file: the user's choice, else the one recorded in the file.
 
-    The user's word counts, because the other way round a model could not be shown as another renderer, or another
-    program, draws it. A file that says something else is then read with a warning.
+    The user's choice has priority, so that a model can be shown as another renderer, or another program, renders it. A
+    file with another label is then read with a warning.
 
     Parameters
     ----------
@@ -129,14 +129,14 @@ def read_population(path: Path, owner: Extension) -> Any:
     Parameters
     ----------
     path : Path
-        What has a suffix that no extension knows is read as a PLY.
+        A file with an unknown suffix is read as a PLY.
     owner : Extension
         Whose population it is, for a PLY; ``CORE`` for the six fields.
 
     Raises
     ------
     InputError
-        The file is damaged or missing, or does not hold what the extension needs.
+        The file is damaged or missing, or lacks an array that the extension needs.
     """
     format_ = find_format(path)
     if format_ is None:
@@ -148,18 +148,18 @@ def read_population(path: Path, owner: Extension) -> Any:
 
 
 def read_model(path: Path, extension: str | None = None) -> ModelFile:
-    """Read a PLY or a compact file on its own; warn of what it lacks, and of what is left out.
+    """Read a PLY or a compact file on its own; warn about parts that it lacks, and about parts that are left out.
 
     Parameters
     ----------
     path : Path
     extension : str, optional
-        Who draws it, ``core`` for 3DGS; by default what the file says.
+        The one that renders it, ``core`` for 3DGS; by default the one recorded in the file.
 
     Raises
     ------
     InputError
-        The file is damaged or missing, its extension is not installed, or it does not hold what that needs.
+        The file is damaged or missing, its extension is not installed, or an array is missing that the extension needs.
     """
     label = label_of(path)
     given = None

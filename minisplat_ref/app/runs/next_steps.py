@@ -1,4 +1,4 @@
-"""How to look at a finished run: commands for the end of a training and for the reports."""
+"""Commands that show a finished run, for the end of a training and for the reports."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ PAGE = "scene.html"
 
 
 class Step(NamedTuple):
-    """A command, and what it is for."""
+    """A command, and its purpose."""
 
     purpose: str
     """An imperative sentence without its full stop."""

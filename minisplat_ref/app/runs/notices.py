@@ -1,6 +1,6 @@
-"""What a run can do without, but should be told of: a scene without points, photographs of a few pixels, no Gaussians.
+"""Warnings that do not stop a run: a scene without points, photographs of a few pixels, no Gaussians.
 
-Each is a warning of one line, which the command line prints before it continues.
+Each is one line, which the command line prints before it continues.
 """
 
 import math
@@ -17,11 +17,11 @@ from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
 from minisplat_ref.types import FILE_FRAME, Model, Scene
 
 N_SIZES = 3  # of photographs that are all named
-FEW_POINTS = 20  # sparse points that say little about a scene
+FEW_POINTS = 20  # sparse points that are too few for a scene
 
 
 def warn_of_scene(scene: Scene, *, is_dense: bool = False) -> None:
-    """Warn of what a scene lacks for a good training.
+    """Warn about properties of a scene that prevent a good training.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def warn_of_scene(scene: Scene, *, is_dense: bool = False) -> None:
 
 
 def report_inventory(path: Path, scene: Scene, model: str | None) -> None:
-    """Say how many photographs of a scene's folder have cameras; warn of what else is there and not used."""
+    """Report how many photographs of a scene's folder have cameras; warn of files that are not used."""
     inventory = take_inventory(path, scene, model)
     if inventory.unused:
         _warn(f"{path}: {inventory.line}")
@@ -71,7 +71,7 @@ def describe_place(scene: Scene) -> str:
 
 
 def describe_sizes(sizes: Sequence[tuple[int, int]]) -> str:
-    """Return the sizes (width, height) of photographs in half a line; how many there are of each, if they are mixed."""
+    """Return the sizes (width, height) of photographs in half a line, with the number of each if they are mixed."""
     counts = sorted(Counter(sizes).items(), reverse=True)
     if len(counts) == 1:
         return f"{sizes[0][0]} x {sizes[0][1]}"

@@ -23,7 +23,7 @@ VIEWS_MIN = 4  # training views: at least two are trained on while the others ar
 
 
 class Run(NamedTuple):
-    """What is to be simplified, with all that its training needs."""
+    """The run to be simplified, with all that its training needs."""
 
     folder: Path
     settings: Settings
@@ -35,13 +35,13 @@ class Run(NamedTuple):
     """Training views numbered."""
     model: Model
     step: int | None
-    """Iterations that the model has been trained, as far as the folder says."""
+    """Iterations that the model has been trained, as far as the folder has them."""
     unfinished: int | None
     """Iteration of the checkpoint that the model is of; None where the run has ended."""
 
     @property
     def render_settings(self) -> RenderSettings:
-        """How the run renders its views."""
+        """The settings with which the run renders its views."""
         conventions, backend = PROFILES[self.settings.profile], get_backend(self.settings.backend)
         return RenderSettings(self.scene.background, conventions, backend, self.recipe.renderer)
 
@@ -60,7 +60,7 @@ class Fold(NamedTuple):
     trained: list[int]
     """Those that fine-tune."""
     held_out: list[int]
-    """Those that measure what comes out."""
+    """The views that measure the result."""
 
 
 def open_run(folder: Path, scene: Path | None = None) -> Run:
@@ -108,7 +108,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
 
 
 def check_views(scene: Scene, what: str) -> None:
-    """Refuse a scene with too few training views to hold some out; ``what`` is what needs them."""
+    """Refuse a scene with too few training views to hold some out; ``what`` names the purpose."""
     n_views = len(scene.train_views)
     if n_views < VIEWS_MIN:
         raise InputError(
@@ -118,7 +118,7 @@ def check_views(scene: Scene, what: str) -> None:
 
 
 def check_renderer(run: Run) -> None:
-    """Refuse a renderer that does not say how much each row weighs in an image."""
+    """Refuse a renderer without the blend weight of each row."""
     settings, reason = run.render_settings, ""
     try:
         if settings.render(run.model, run.scene.train_views[0], frozenset({"stats"}))[0].stats is not None:

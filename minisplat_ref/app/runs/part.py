@@ -1,8 +1,8 @@
 """A part of a scene that is trained for itself: which photographs, which of their pixels, and where its Gaussians are.
 
 A part is two files, ``NAME.json`` and, beside it, ``NAME.npz`` with cameras, points and masks. They have all that a
-training needs of the scene besides its photographs: the model of a large scene is read by whoever plans its parts, and
-not again for each. Places are in the frame of the scene's files, on a plane: a point x has the coordinates
+training needs of the scene besides its photographs: the model of a large scene is read once, when its parts are
+planned, and not again for each. Places are in the frame of the scene's files, on a plane: a point x has the coordinates
 ``axes (x - origin)``.
 """
 
@@ -44,7 +44,7 @@ class Plane(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A rectangle of the plane, half-open: what touches the upper edge is outside."""
+    """A rectangle of the plane, half-open: points on the upper edge are outside."""
 
     low: tuple[float, float]
     """Minus infinity where it has no end."""
@@ -61,7 +61,7 @@ class Box(NamedTuple):
 
 
 class Region(NamedTuple):
-    """Where the first Gaussians of a part are."""
+    """The box of a part's first Gaussians."""
 
     plane: Plane
     box: Box
@@ -76,7 +76,7 @@ class Region(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What one block trains on."""
+    """The data that one block is trained on."""
 
     region: Region
     """The block with its surroundings."""
@@ -126,7 +126,7 @@ class Part(NamedTuple):
 
 
 def read_part(path: Path, source: Path) -> Part:
-    """Read what :meth:`Part.write` wrote.
+    """Read the files of :meth:`Part.write`.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def read_part(path: Path, source: Path) -> Part:
     Raises
     ------
     InputError
-        A file is missing, or is not what it should be.
+        A file is missing or damaged.
     """
     region, content = read_region(path), read_json_object(path)
     try:
@@ -165,7 +165,7 @@ def _of_another_version(path: Path, error: Exception) -> InputError:
 
 
 def box_from_json(content: Any) -> Box:
-    """Read what :meth:`Box.to_json` wrote; raises TypeError or ValueError for anything else."""
+    """Read the output of :meth:`Box.to_json`; raises TypeError or ValueError for anything else."""
     (x0, y0), (x1, y1) = content
     low = tuple(-math.inf if value is None else float(value) for value in (x0, y0))
     high = tuple(math.inf if value is None else float(value) for value in (x1, y1))

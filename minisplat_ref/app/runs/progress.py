@@ -1,4 +1,4 @@
-"""What a person sees of a running training, and the same in a file: the progress bar and ``log.jsonl``."""
+"""Progress of a running training, for a person and for programs: the progress bar and ``log.jsonl``."""
 
 import json
 import sys
@@ -26,7 +26,7 @@ BAR_SECONDS = 0.3  # between redraws of the bar
 
 
 class Clock(NamedTuple):
-    """How long a training has taken, with the earlier parts of a continued run and without what is not training."""
+    """The time of a training, with the earlier parts of a continued run and without evaluation and output."""
 
     seconds: float
     """On the wall."""
@@ -79,7 +79,7 @@ class Progress(AbstractContextManager["Progress"]):
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop both clocks for what is not training."""
+        """Stop both clocks for work other than training."""
         start, cpu_start = time.perf_counter(), time.process_time()
         try:
             yield
@@ -90,7 +90,7 @@ class Progress(AbstractContextManager["Progress"]):
     def __call__(self, report: StepReport) -> None:
         """Move the bar; every LOG_EVERY iterations measure, show and write.
 
-        ``model_mb`` of a record is what the arrays of the Gaussians take. During an iteration their gradients take as
+        ``model_mb`` of a record is the size of the Gaussians' arrays. During an iteration their gradients take as
         much again, and Adam's two moments twice as much all the time.
         """
         self._bar.total = report.last_step  # None while the recipe has not decided it
@@ -131,7 +131,7 @@ class Progress(AbstractContextManager["Progress"]):
         self._bar.initial = self._bar.last_print_n = self._bar.n + 1
 
     def _min_rest(self, report: StepReport) -> str:
-        """Say how long a training that has not decided its length continues at least: as if it began to cool now."""
+        """Estimate the shortest rest of a training that has not decided its length: as if it began to cool now."""
         if self._cooling is None or report.last_step is not None:
             return ""
         bar = self._bar.format_dict

@@ -46,7 +46,7 @@ def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings)
     settings : Settings
     """
     if not get_backend(settings.backend).is_compiled:
-        return None  # NumPy takes minutes for what is timed here
+        return None  # NumPy takes minutes for the timed work
     view = max(scene.train_views, key=lambda view: view.camera.width * view.camera.height)
     width, height = view.camera.width, view.camera.height
     factor = comfortable_factor(width, height)

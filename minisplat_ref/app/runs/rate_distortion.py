@@ -1,15 +1,15 @@
-"""How small a model may be: the drop of each size with its standard error, and the search for the smallest.
+"""The loss of quality at each size of a model, with its standard error, and the search for the smallest size.
 
 A *size* is a number of Gaussians. The same V photographs are measured before and after, so the drop is a mean of paired
-differences d_v = PSNR_v(before) - PSNR_v(after), in which what makes one photograph harder than another cancels::
+differences d_v = PSNR_v(before) - PSNR_v(after), in which the difficulty of each photograph cancels::
 
     drop = mean of d_v,   standard error = sqrt(sum (d_v - drop)^2 / (V - 1) / V)
 
 A size is within a limit if its drop plus one standard error is. The search goes down from all Gaussians by factors of
-sqrt(2) to the first size that is not within the limit, and then halves, on a logarithmic scale, what lies between.
+sqrt(2) to the first size that is not within the limit, and then halves the interval on a logarithmic scale.
 
 There is no knee. Where the PSNR falls evenly with the logarithm of the count, as it does once a training has removed
-what it does not need, a knee lies wherever the measured sizes happen to begin and end, and may cost many dB.
+what it does not need, the place of a knee depends on the first and last measured size, and may cost many dB.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ class Point(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The drop plus its standard error, dB: what has to be within a limit."""
+        """The drop plus its standard error, dB, which has to be within a limit."""
         return self.drop + self.standard_error
 
 
@@ -79,7 +79,7 @@ def paired_drop(before: Sequence[float], after: Sequence[float]) -> tuple[float,
     Parameters
     ----------
     before, after : sequence of V floats
-        dB, of the same views; what is above ``PSNR_MAX``, as that of equal images is, counts as that.
+        dB, of the same views; values above ``PSNR_MAX``, such as that of equal images, count as that.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What the reports of runs share: held-out views with their errors, curves over the training, and what fired."""
+"""Parts that the reports of runs share: held-out views with their errors, curves over the training, and mechanisms."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,12 +17,12 @@ Records = Sequence[Mapping[str, Any]]
 
 
 def view_panel(label: str, truth: Image8, render: Image8, error: Image8) -> str:
-    """Return a held-out view: truth against render, and the error beside them.
+    """Return a panel of a held-out view: truth against render, and the error beside them.
 
     Parameters
     ----------
     label : str
-        Name of the view, and what was measured.
+        Name of the view, and its metrics.
     truth, render, error : ndarray of shape (H, W, 3)
         sRGB.
     """
@@ -45,6 +45,6 @@ def curve(records: Records, key: str, title: str, color: str) -> str:
 
 
 def fired_tables(fired: Fired) -> list[str]:
-    """Return what the mechanisms of a recipe have done, and what they have noted."""
+    """Return the actions of a recipe's mechanisms, and their notes."""
     acted, noted = rows(fired), remarks_by_mechanism(fired)
     return [*([table(acted, HEADING)] if acted else []), *([table(noted.items())] if noted else [])]

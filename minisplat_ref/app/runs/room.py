@@ -1,4 +1,4 @@
-"""Whether a training fits into memory, before it begins: what its first iterations and measurements will take.
+"""The memory that a training needs for its first iterations and evaluations, estimated before it begins.
 
 The pairs (tile, Gaussian) are estimated from a sample of the Gaussians in a few views. A convex shape of area A and
 width and height w and h, wherever it lies, touches on average ``1 + w / W + h / H + A / (W H)`` tiles of size W x H;
@@ -20,9 +20,9 @@ N_VIEWS, N_SAMPLED = 4, 5000
 
 
 def foresee(scene: Scene, state: TrainState, conventions: Conventions, backend: Backend) -> memory.Needs:
-    """Return what a training takes of memory as it begins, besides what the program and the photographs take already.
+    """Return the memory that a training takes as it begins, besides that of the program and the photographs.
 
-    Photographs that do not all fit give up, or get, what room is left.
+    Photographs that do not all fit give up, or get, the room that is left.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def _n_pairs(gaussians: Any, camera: Camera, conventions: Conventions, backend: 
     width, height = (seen.boxes[is_seen, 2:] - seen.boxes[is_seen, :2]).T  # [V] each
     a, b, c = seen.conics[is_seen].T  # [V] each
     area = 2 * np.pi * np.log(seen.opacities[is_seen] / conventions.alpha_min) / np.sqrt(a * c - b * b)
-    area = np.minimum(area, width * height)  # of what the image cuts off there is no tile
+    area = np.minimum(area, width * height)  # parts outside the image have no tiles
     tile_width, tile_height = backend.tile_width, backend.tile_height
     n_tiles = 1 + width / tile_width + height / tile_height + area / (tile_width * tile_height)
     n_tiles = np.minimum(n_tiles, -(-camera.width // tile_width) * -(-camera.height // tile_height))

@@ -1,4 +1,4 @@
-"""The folder that ``train`` leaves: which file is called what, and how each is read and written."""
+"""The folder that ``train`` leaves: the names of its files, and their readers and writers."""
 
 import json
 import os
@@ -18,17 +18,17 @@ SHARED = run_files.SHARED
 CAMERAS = run_files.CAMERAS
 METRICS = run_files.METRICS
 LOG = "log.jsonl"  # one record every few steps
-CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
+CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, on request
 EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
-CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
+CHECKPOINT = "checkpoint.npz"  # the state that `--resume` continues
 PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
-DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
-REPORT = "report.html"  # all of it to look at
+DECISIONS = "decisions.json"  # measurements and decisions of a recipe that decides its own length
+REPORT = "report.html"  # a report of all of it
 BLOCK_PLAN = "plan.png"  # the blocks seen from above
 BLOCKS = "blocks"  # the trainings of which it was merged, where it was trained in blocks
 RENDERS = "renders"  # truth | render | error of each test view
 
-WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # what has taken time; a run without any has not begun
+WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # files that have taken time; a run without any has not begun
 
 
 def check_free(folder: Path) -> None:
@@ -56,13 +56,13 @@ def check_free(folder: Path) -> None:
 
 
 def has_begun(folder: Path) -> bool:
-    """Return whether a run has anything that took time; if not, it can begin again."""
+    """Return whether a run has files that took time; if not, it can begin again."""
     return any((folder / name).exists() for name in WORK)
 
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing into a run, and clear away what killed ones were writing.
+    """Keep other processes from writing into a run, and remove unfinished files of killed ones.
 
     The lock is the system's, on the folder itself, and ends with the process. Windows and some network disks have none.
 
@@ -111,7 +111,7 @@ def measured_step(folder: Path) -> int | None:
 
 
 def is_finished(folder: Path, iterations: int) -> bool:
-    """Return whether a run has been measured after its last iteration: that is what it does in the end.
+    """Return whether a run has been measured after its last iteration, which is its final step.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def is_finished(folder: Path, iterations: int) -> bool:
 
 
 def remove(folder: Path) -> None:
-    """Take back what a training that could not begin has written, and the folder if nothing else is in it."""
+    """Remove the files of a training that could not begin, and the folder if nothing else is in it."""
     for name in (CONFIG, CAMERAS, LOG, CURVE, EVENTS, DECISIONS, CHECKPOINT, PREVIOUS):
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):

@@ -46,7 +46,7 @@ def write_report(folder: Path, scene: Scene, metrics: dict[str, Any]) -> None:
     scene : Scene
         That it was trained on.
     metrics : dict
-        What ``metrics.json`` holds, or will: the page comes before it, since that file says that a run has ended.
+        The content of ``metrics.json``, which is written after the page, since it marks the end of a run.
 
     Raises
     ------

@@ -26,7 +26,7 @@ from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
 
 class Trained(NamedTuple):
-    """The model of a run, and how the run draws it."""
+    """The model of a run, and the settings of its renderer."""
 
     model: Model
     renderer: Renderer
@@ -44,7 +44,7 @@ class Trained(NamedTuple):
 
 
 def renderer_of(settings: Settings, model: Model) -> Renderer:
-    """Return how a run draws its model: with the sky that it has been given, too."""
+    """Return the model of a run with its renderer: with the sky that it has been given, too."""
     return as_trained(recipe_of(settings), model).renderer
 
 
@@ -90,7 +90,7 @@ def measure(
 def score(folder: Path, scene: Scene, model: Model, settings: Settings, network: Network | None = None) -> Evaluation:
     """Evaluate the test views and write ``renders/NAME.png``: truth, render and error side by side.
 
-    What ``renders`` held before is gone when all views have been measured, and not earlier.
+    The earlier content of ``renders`` is removed when all views have been measured, and not earlier.
 
     Parameters
     ----------

@@ -1,22 +1,22 @@
-"""``simplify``: a run made smaller after the fact, and what that costs, measured on views that take no part.
+"""``simplify``: a finished run made smaller, and the loss of quality, measured on views that take no part.
 
 A size is reached by merging near neighbours, those of small blend weight first
-(:func:`..strategy.simplify.merge_neighbours`), and is then fine-tuned. The population of an extension, whose further
-fields may have no mean, keeps its Gaussians of the largest blend weight instead. Either way the weight is summed over
-pixels and views (equation 12 of Mini-Splatting).
+(:func:`minisplat_ref.strategy.simplify.merge_neighbours`), and is then fine-tuned. The population of an extension,
+whose further fields may have no mean, keeps its Gaussians of the largest blend weight instead. Either way the weight is
+summed over pixels and views (equation 12 of Mini-Splatting).
 
-What a size loses is measured by cross-validation: the *training* views are divided into folds
-(:attr:`..runs.opened_run.Run.folds`), and the views of each fold measure a copy that was fine-tuned without them. So
+The loss of a size is measured by cross-validation: the *training* views are divided into folds
+(:attr:`.opened_run.Run.folds`), and the views of each fold measure a copy that was fine-tuned without them. So
 every training view counts, and the standard error is as small as the photographs allow. The model that is delivered
-begins with the same Gaussians, and is fine-tuned in the same way by all training views. (Weights say nothing about
-photographs, only about cameras.) The test views stay sealed until then.
+begins with the same Gaussians, and is fine-tuned in the same way by all training views. (Weights depend on the cameras
+only, not on the photographs.) The test views stay sealed until then.
 
-Fine-tuning alone changes a copy: it may continue to learn, and it forgets what is peculiar to the held-out views, which
-the run was trained on. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike. Since
-neither copy forgets all of it, and the larger one knows more of it, the drop is rather too large than too small.
+Fine-tuning alone changes a copy: it may continue to learn, and it forgets details of the held-out views, which the run
+was trained on. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned in the same way.
+Since neither copy forgets all of them, and the larger one retains more, the drop is rather too large than too small.
 
-Where every smaller size loses more than the limit, the run is as small as it gets, and stays as it is. So it may be
-after ``adaptive``, which has removed by itself what is not worth its place.
+Where every smaller size loses more than the limit, the run is as small as it gets, and stays as it is. This may happen
+after ``adaptive``, which has already removed what is not worth its place.
 
 Fine-tuning has the run's losses, all degrees of the spherical harmonics, no events, and moments of zero. Of a recipe
 with a schedule it has the last rates; one that decides its own length cools down once more, from the rates before its
@@ -50,11 +50,11 @@ from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import DEGREES, TrainState
 from minisplat_ref.types import Floats, Model, View
 
-DEFAULT_DROP = 0.1  # dB, what may be lost where nothing is asked for
+DEFAULT_DROP = 0.1  # dB, the default limit of the loss
 
 
 class Target(NamedTuple):
-    """What is asked for; a drop of at most ``DEFAULT_DROP`` where all is None."""
+    """The request; a drop of at most ``DEFAULT_DROP`` where all is None."""
 
     max_drop: float | None = None
     """dB that may be lost on held-out training views, with one standard error."""
@@ -65,7 +65,7 @@ class Target(NamedTuple):
 
     @property
     def limit(self) -> float | None:
-        """What may be lost, dB; None where the size is given."""
+        """The largest loss, dB; None where the size is given."""
         if self.budget is not None or self.max_bytes is not None:
             return None
         return DEFAULT_DROP if self.max_drop is None else self.max_drop
@@ -80,7 +80,7 @@ class Decision(NamedTuple):
     """The measured sizes, and which of them was chosen."""
 
     reference: Point
-    """All Gaussians, fine-tuned alike."""
+    """All Gaussians, fine-tuned in the same way."""
     points: tuple[Point, ...]
     """The smaller sizes, ascending."""
     chosen: Point
@@ -88,7 +88,7 @@ class Decision(NamedTuple):
     run_psnr: float
     """dB, of the run as it is on its training views, which it was trained on."""
     is_all_that_matter: bool
-    """Whether the budget, or the bytes, are more than all Gaussians that any view sees take."""
+    """Whether the budget, or the bytes, suffice for all Gaussians that any view sees."""
 
     @property
     def is_unchanged(self) -> bool:
@@ -97,7 +97,7 @@ class Decision(NamedTuple):
 
 
 def ply_size(run: Run) -> PlySize:
-    """Return what the PLY of the run's population takes, measured on files of one row and of two."""
+    """Return the size of the PLY of the run's population, measured on files of one row and of two."""
     n_bytes = []
     with tempfile.TemporaryDirectory() as folder:
         for n in (1, 2):
@@ -142,7 +142,7 @@ def limit_of(target: Target, size: PlySize) -> int | None:
 
 
 def fine_tuning(recipe: Recipe, iterations: int) -> tuple[Recipe, Pace]:
-    """Return the recipe of this many iterations after the schedule's end without events, and how far it has cooled."""
+    """Return the recipe of this many iterations after the schedule's end without events, and its stage of cooling."""
     end = recipe.iterations + iterations
     rates, pace = recipe.learning_rates, Pace(cooling_from=recipe.iterations, last_step=end)
     if recipe.cooling is None:
@@ -315,7 +315,7 @@ def cross_validate(run: Run, gaussians: Any, iterations: int) -> list[ViewMetric
 
 
 def finish(run: Run, n: int, iterations: int) -> Model:
-    """Return ``n`` Gaussians in place of the run's, reduced and fine-tuned by all training views."""
+    """Return ``n`` Gaussians instead of the run's, reduced and fine-tuned by all training views."""
     views = run.scene.train_views
     smaller = reduce(run, blend_weights(run), n)
     with progress_bar(f"fine-tuning {n:,} Gaussians", "iterations", iterations) as bar:

@@ -1,4 +1,4 @@
-"""What ``simplify`` shows: its table, the curve as a figure, and ``report.html``."""
+"""The output of ``simplify``: its table, the curve as a figure, and ``report.html``."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -57,7 +57,7 @@ def table_rows(result: dict[str, Any]) -> list[list[str]]:
 
 
 def describe_decision(result: dict[str, Any]) -> str:
-    """Return what was chosen and what it loses, or that the run is as small as it gets, in one line."""
+    """Return the chosen size and its loss, or that the run is as small as it gets, in one line."""
     chosen, n_views = result["chosen"], len(result["views"])
     held_out = f"on {n_views} training views, each held out in turn"
     if not result["is_unchanged"]:
@@ -76,7 +76,7 @@ def describe_decision(result: dict[str, Any]) -> str:
 
 
 def describe_outcome(result: dict[str, Any]) -> str:
-    """Return what became of the test views, in one line."""
+    """Return the change of the test views, in one line."""
     counts = f"{result['all']['n_gaussians']:,} -> {result['chosen']['n_gaussians']:,} Gaussians"
     if result["is_unchanged"]:
         counts = f"{result['chosen']['n_gaussians']:,} Gaussians"
@@ -98,12 +98,12 @@ def _with_error(drop: dict[str, Any]) -> str:
 
 
 def draw(result: dict[str, Any]) -> Figure:
-    """Draw PSNR and drop against the number of Gaussians, with what was chosen."""
+    """Plot PSNR and drop against the number of Gaussians, with the chosen size."""
     return _figure(result, _draw_psnr, _draw_drop)
 
 
 def _figure(result: dict[str, Any], *draws: Callable[[Axes, dict[str, Any]], None]) -> Figure:
-    """Draw plots beside each other."""
+    """Plot side by side."""
     with rc_context(PLOT_STYLE):
         figure = Figure(figsize=(5.2 * len(draws), 3.9), layout="constrained")
         for axes, draw_on in zip(figure.subplots(1, len(draws), squeeze=False)[0], draws, strict=True):
@@ -205,7 +205,7 @@ def _panel(view: Shown) -> str:
 
 
 def _decision(result: dict[str, Any]) -> str:
-    """Say what the rule was and what it led to."""
+    """Describe the rule and its result."""
     found = describe_decision(result)
     if result["max_drop"] is not None:
         limit = f"{result['max_drop']:g} dB"

@@ -1,4 +1,4 @@
-"""The folder that ``simplify`` leaves: a run like others, without a checkpoint, and what it was chosen by.
+"""The folder that ``simplify`` leaves: a run like others, without a checkpoint, and the evidence for its size.
 
 ``config.json`` is that of the run with one entry more, so ``render``, ``eval``, ``info`` and ``convert`` take the
 folder like that of a training. Nothing in it depends on the time: the same run gives the same bytes.
@@ -22,12 +22,12 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.metrics import Evaluation, ViewMetrics
 from minisplat_ref.types import Floats, Model, View
 
-RESULT, FIGURE = "result.json", "figure.png"  # the decision, beside what every run has
+RESULT, FIGURE = "result.json", "figure.png"  # the decision, in addition to the files of every run
 N_SHOWN = 3  # test views
 
 
 class Asked(NamedTuple):
-    """What the command line says."""
+    """The options of the command line."""
 
     run: Path
     out: Path
@@ -35,7 +35,7 @@ class Asked(NamedTuple):
     fine_tune: int
     """Iterations."""
     scene: Path | None = None
-    """Where the photographs are now, if they have moved."""
+    """The present folder of the photographs, if they have moved."""
 
 
 def simplify_run(asked: Asked) -> dict[str, Any]:
@@ -81,14 +81,14 @@ def _images(run: Run, model: Model) -> dict[str, Image8]:
 
 
 def _render_both(run: Run, model: Model) -> list[Shown]:
-    """Return the first test views as the run and the new model draw them."""
+    """Return the first test views as the run and the new model render them."""
     before, after = _images(run, run.model), _images(run, model)
     views = [view.load() for view in run.scene.test_views[:N_SHOWN]]
     return [Shown(view.name, view.image, before[view.name], after[view.name]) for view in views]
 
 
 def to_result(run: Run, asked: Asked, decision: Decision) -> dict[str, Any]:
-    """Return how a size was decided on, as JSON holds it."""
+    """Return the decision on a size, for JSON."""
     size = run.scene.train_views[0].camera
     return {
         "run": str(asked.run.resolve()),
@@ -118,7 +118,7 @@ def _of_point(point: Point) -> dict[str, Any]:
 
 
 def of_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | None:
-    """Return what became of the test views, as JSON holds it.
+    """Return the change of the test views, for JSON.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def of_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | Non
 
 
 def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation) -> None:
-    """Write what makes the folder a run: its configuration, cameras and measures."""
+    """Write the files that make the folder a run: its configuration, cameras and metrics."""
     config = run_folder.read_json_object(run.folder / run_folder.CONFIG)
     about = {name: result[name] for name in ("run", "target", "fine_tune")}
     config |= {"settings": asdict(run.settings), "simplified": about}
@@ -171,7 +171,7 @@ def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation
 
 
 def _lost(result: dict[str, Any]) -> dict[str, Any]:
-    """Return what the chosen size loses on held-out training views, as ``metrics.json`` holds it."""
+    """Return the loss of the chosen size on held-out training views, for ``metrics.json``."""
     chosen = result["chosen"]
     return {
         "drop": chosen["drop"],

@@ -1,4 +1,4 @@
-"""What ``render`` and ``view`` show: a run, or a file of Gaussians that any program wrote, opened to be drawn."""
+"""The input of ``render`` and ``view``: a run, or a file of Gaussians that any program wrote, ready to be rendered."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,11 +27,11 @@ class Source(NamedTuple):
     cameras: list[Viewpoint]
     """Of the run; empty for a file."""
     path: Path
-    """What was opened."""
+    """The opened source."""
     frame: Frame
 
     def beside(self, name: str) -> Path:
-        """Return where what is made of it goes by default: inside of a run, beside a file."""
+        """Return the default folder of the output: inside of a run, beside a file."""
         return self.path / name if self.path.is_dir() else self.path.with_name(f"{self.path.stem}-{name}")
 
 
@@ -43,11 +43,11 @@ def open_source(path: Path, extension: str | None = None, environment: Path | No
     path : Path
         Folder of a run, or file.
     extension : str, optional
-        Who draws a file, ``core`` for 3DGS; by default what the file says.
+        The one that renders a file, ``core`` for 3DGS; by default the one recorded in the file.
     environment : Path, optional
         Other light for a model that is lit.
     **given
-        ``background``, ``profile`` and ``backend`` in place of the run's; None counts as not given.
+        ``background``, ``profile`` and ``backend`` instead of the run's; None counts as not given.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a training starts from in place of the scene's own points: a point cloud, or the model of a run (``--init``)."""
+"""The start of a training other than the scene's points: a point cloud, or the model of a run (``--init``)."""
 
 from functools import partial
 from pathlib import Path
@@ -24,13 +24,13 @@ from minisplat_ref.types import Gaussians, Model, Scene
 
 
 class Start(NamedTuple):
-    """The state before the first iteration of a training that is given what to start from."""
+    """The state before the first iteration of a training with a given start."""
 
     state: TrainState
     source: str | None
-    """What it starts from, in one line; None for the scene's own points."""
+    """The source of the start, in one line; None for the scene's own points."""
     notices: list[str]
-    """Sentences on what the source lacks."""
+    """Sentences about missing parts of the source."""
 
 
 def start_from(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int) -> Start:
@@ -59,7 +59,7 @@ def start_from(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int)
                 " give --init FILE, or a run of that recipe"
             )
         return Start(initial_state(scene, recipe, seed), None, [])
-    recipe = recipe._replace(starts_densely=False)  # from these points, as asked
+    recipe = recipe._replace(starts_densely=False)  # from these points, as requested
     if Path(path).is_dir():
         return continue_model(Path(path), scene, recipe, seed)
     if from_file is not None:
@@ -72,8 +72,8 @@ def start_from(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int)
 def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Start:
     """Return the start of a training from the model of a run, which may have another recipe and another renderer.
 
-    The Gaussians of 3DGS become the recipe's population as those of the scene's points would. What the training of the
-    run has besides its model does not go on: moments, statistics and the order of the views begin afresh.
+    The Gaussians of 3DGS become the recipe's population as those of the scene's points would. Only the model of the run
+    is continued: moments, statistics and the order of the views begin afresh.
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
     Raises
     ------
     InputError
-        The folder holds no run; its population, or its parameters of photographs and sky, are not what the recipe
-        trains; or no training view sees the model.
+        The folder holds no run; its population, or its parameters of photographs and sky, are not those of the recipe;
+        or no training view sees the model.
     """
     theirs = load(folder)
     owner = owner_of(theirs.recipe, theirs.extension) or CORE
@@ -154,7 +154,7 @@ def _check_shared(folder: Path, model: Model, state: TrainState, recipe: Recipe)
 def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
     """Read a point cloud and replace the scene's points by it.
 
-    The scene that is returned is for the start alone: its views do not know which of these points they see.
+    The scene that is returned is for the start alone: its views have no ids of the points that they see.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
     start : Scene
         For :func:`minisplat_ref.training.loop.initial_state`.
     notices : list of str
-        Sentences on what the file lacks.
+        Sentences about missing parts of the file.
 
     Raises
     ------

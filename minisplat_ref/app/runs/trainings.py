@@ -1,6 +1,6 @@
-"""Trainings that are processes of their own, with folders from which they continue: how far one is, and what is next.
+"""Trainings as separate processes, with folders from which they continue: the status of each, and its next command.
 
-A process of its own has a peak memory of its own, and when it is killed, nothing else ends.
+A separate process has a separate peak memory, and when it is killed, nothing else ends.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ SAVING_SECONDS = 5.0  # after Ctrl-C; a training that continues for longer has n
 PROGRAM = (sys.executable, "-m", "minisplat_ref")
 
 Status = Literal["finished", "cut off", "lost", "new"]
-"""How far a training has come: to its end, to a checkpoint, not as far, or not begun."""
+"""The status of a training: complete, at a checkpoint, before the first one, or not begun."""
 
 HEADINGS: dict[Status, str] = {
     "finished": ": finished, kept",
@@ -33,11 +33,11 @@ HEADINGS: dict[Status, str] = {
     "new": ": started",
 }
 
-REPORTED_CODES = (0, 2, 130)  # after which the training has said all there is to say
+REPORTED_CODES = (0, 2, 130)  # after which the training has printed its line of explanation
 
 
 def status_of(folder: Path, asked: Settings) -> Status:
-    """Return how far the training in a folder has come.
+    """Return the status of the training in a folder.
 
     Raises
     ------
@@ -62,9 +62,9 @@ def status_of(folder: Path, asked: Settings) -> Status:
 
 
 def words_to_end(folder: Path, asked: Settings, first: Sequence[str]) -> list[str] | None:
-    """Return the command that takes a training from where it is to its end, as words; None if it has ended.
+    """Return the command that completes a training, as words; None if it has ended.
 
-    What is left of a training without a checkpoint is removed.
+    Files of a training without a checkpoint are removed.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def train_here(words: Sequence[str]) -> int:
     Raises
     ------
     KeyboardInterrupt
-        After Ctrl-C or SIGTERM, when it has saved what there is.
+        After Ctrl-C or SIGTERM, when it has saved its state.
     CalledProcessError
         It has been killed or has a programming error.
     """

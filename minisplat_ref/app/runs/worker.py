@@ -1,9 +1,9 @@
-"""What a worker does with a job: check that it is of this version and sees the files, run the command, and wait.
+"""The worker's side of a job: check that it is of this version and sees the files, run the command, and wait.
 
-A job becomes a command in a process of its own, so that its peak memory and its threads are its own, and nothing but
-names and paths crosses the network. The process has one Numba thread, unless NUMBA_NUM_THREADS of the worker says
-otherwise. A file beside the results, the token, says that somebody still waits for them: when it is gone, the command
-is told to save and to end, as by Ctrl-C.
+A job becomes a command in a separate process, so that its peak memory and its threads are its own, and nothing but
+names and paths crosses the network. The process has one Numba thread, unless the worker sets NUMBA_NUM_THREADS. A file
+beside the results, the token, exists while the results are awaited: when it is gone, the command is told to save and to
+end, as by Ctrl-C.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ ATTACHED = (sys.executable, "-m", "minisplat_ref.app.runs.attached")
 COMPILE = "from minisplat_ref.app.runs.first_use import compile_kernels; compile_kernels('cpu')"
 POLL_SECONDS = 0.5  # between looks at the token
 RELEASE_SECONDS = 30.0  # in which the process of a killed worker has let go of the folder
-SAID_BYTES = 8000  # of the end of what a command printed, to show if it fails
+SAID_BYTES = 8000  # of the end of a command's output, to show if it fails
 INTERRUPTED = 130
 
 
@@ -54,10 +54,10 @@ def unless_exists(file: Path, words: Sequence[str]) -> Sequence[str] | None:
 
 
 class Site(NamedTuple):
-    """What all workers must find on the storage that they share."""
+    """The paths that all workers must find on the storage that they share."""
 
     token: Path
-    """Absolute; there as long as somebody waits."""
+    """Absolute; the file exists as long as the results are awaited."""
     folder: Path
     """Absolute; the working folder of the commands, to which their relative paths belong."""
     inputs: tuple[Path, ...] = ()
@@ -65,12 +65,12 @@ class Site(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How a job ended."""
+    """The end of a job."""
 
     code: int
-    """Exit code of the command; 0 where there was nothing to do, 130 where nobody waits any longer."""
+    """Exit code of the command; 0 where there was nothing to do, 130 where the results are no longer awaited."""
     said: str = ""
-    """The end of what it printed."""
+    """The end of its output."""
 
 
 def versions() -> dict[str, str]:
@@ -89,7 +89,7 @@ def unseen(site: Site) -> str | None:
 
 
 def compile_once() -> None:
-    """Compile this machine's kernels if none are on disk; what goes wrong is told by the command that needs them."""
+    """Compile this machine's kernels if none are on disk; errors are reported by the command that needs them."""
     subprocess.run([sys.executable, "-c", COMPILE], stdin=subprocess.DEVNULL, capture_output=True, check=False)
 
 
@@ -118,7 +118,7 @@ def carry_out(job: Job, site: Site) -> Outcome:
 
 
 def unseen_line(worker: str, path: str) -> str:
-    """Return what is said of a worker that does not see a path."""
+    """Return the message about a worker that does not see a path."""
     return f"worker {worker} does not see {path}: put it on storage that all workers share under the same path"
 
 

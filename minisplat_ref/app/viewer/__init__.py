@@ -1,9 +1,9 @@
-"""A trained scene in the browser, drawn by the renderer that trained it.
+"""A trained scene in the browser, rendered by the renderer that trained it.
 
-What a frame is, is decided without a browser: :mod:`.poses` (where a camera is, and paths through several),
-:mod:`.progression` (how large the next frame is), :mod:`.layers` (what of it is shown). :mod:`.browser` alone knows
-viser, an optional package, and hands these the camera of each browser that is connected.
+The content of a frame is decided without a browser: :mod:`.poses` (the pose of a camera, and paths through several),
+:mod:`.progression` (the size of the next frame), :mod:`.layers` (the layers that it can show). Only :mod:`.browser`
+uses viser, an optional package, and passes the camera of each connected browser to these.
 
 All rendering happens in the thread that calls :meth:`.browser.Viewer.draw_next`, the main one: kernels never run twice
-at once, and a training draws between two iterations.
+at once, and during a training frames are rendered between two iterations.
 """

@@ -1,8 +1,8 @@
 """The window of a viewer: a server on this machine, by viser, that browsers connect to.
 
-viser's threads receive what browsers send. They only leave it where :meth:`Viewer.draw_next` finds it, which does the
-work in the thread that calls it. What a browser sends decides what is drawn and never which file is written: a page of
-somebody else can talk to this port, too.
+viser's threads receive the messages of browsers. They only leave it where :meth:`Viewer.draw_next` finds it, which does
+the work in the thread that calls it. Messages of a browser decide what is rendered, never which file is written: a page
+from another site can use this port, too.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.viewpoints import Viewpoint
 
 HOST = "127.0.0.1"
-POLL_SECONDS = 0.02  # between looks at what browsers want
+POLL_SECONDS = 0.02  # between polls of the browsers' requests
 LONGEST, LONGEST_MIN, LONGEST_MAX = 960, 160, 1920  # pixels of the longer side of a full frame
 JPEG_QUALITY = 90
 LINE_WIDTH = 1.5  # pixels, of cameras
@@ -33,19 +33,19 @@ FILM_SECONDS = 4.0
 
 
 class Content(NamedTuple):
-    """What is looked at."""
+    """The model that is shown."""
 
     trained: Trained
     cameras: Sequence[Viewpoint]
     """In the frame of the model; may be empty."""
     photographs: Callable[[], dict[str, Image8]] | None
-    """Loads the photographs by the cameras' names, when they are first asked for."""
+    """Loads the photographs by the cameras' names, when they are first needed."""
     film: Path | None
-    """What a film is written to; None: there are none."""
+    """The file that a film is written to; None: there are none."""
 
 
 class _Window:
-    """What one browser shows, and since when it has wanted what it wants."""
+    """The state of one browser, and the time of its latest request."""
 
     def __init__(self) -> None:
         self.shown, self.wanted, self.since = Shown(), None, 0.0
@@ -86,16 +86,16 @@ def open_server(port: int, label: str) -> Any:
             reason = getattr(error, "strerror", None) or "ports end at 65535"
             raise InputError(f"port {port} cannot be used ({reason}): give another one, or 0 for any") from None
         port = trial.getsockname()[1]
-    with contextlib.redirect_stdout(io.StringIO()):  # a table of its own
+    with contextlib.redirect_stdout(io.StringIO()):  # a separate table
         server = viser.ViserServer(host=HOST, port=port, label=label, verbose=False)
-    if server.get_port() != port:  # somebody was faster, and viser went on to the next
+    if server.get_port() != port:  # another program was faster, and viser continued with the next
         server.stop()
         raise InputError(f"port {port} is in use: give another one, or 0 for any")
     return server
 
 
 def address(server: Any) -> str:
-    """Return what is to be opened in a browser."""
+    """Return the address to open in a browser."""
     return f"http://{HOST}:{server.get_port()}"
 
 
@@ -150,7 +150,7 @@ class Viewer:
         self._version += 1
 
     def draw_next(self) -> bool:
-        """Do what browsers have asked for, then draw one frame for each that needs one; return whether any did."""
+        """Handle the browsers' requests, then render one frame for each that needs one; return whether any did."""
         while not self._asked.empty():
             self._asked.get()()
         clients = self._server.get_clients()
@@ -245,7 +245,7 @@ class Viewer:
 
 
 def serve(viewer: Viewer) -> None:
-    """Draw what browsers want until Ctrl-C."""
+    """Render for the browsers until Ctrl-C."""
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             if not viewer.draw_next():

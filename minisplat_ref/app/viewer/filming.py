@@ -15,7 +15,7 @@ FPS = 25.0
 
 
 class Film(NamedTuple):
-    """How a film is made."""
+    """Options of a film."""
 
     path: Path
     """``.gif`` or ``.mp4``, which is replaced."""
@@ -26,7 +26,7 @@ class Film(NamedTuple):
 
 
 def write_travel(trained: Trained, keyframes: Sequence[Pose], film: Film, on_frame: Callable[[int, int], None]) -> int:
-    """Render the path through keyframes, and write it as a film; return how many images it has.
+    """Render the path through keyframes, and write it as a film; return the number of its images.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What of a view is shown: its colours, or a map of what they are made of."""
+"""The layers of a view that can be shown: its colours, or a map of their components."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ class Picture(NamedTuple):
 
     image: Image8
     caption: str
-    """What its colours mean, in a few words; empty for the colours themselves."""
+    """The meaning of its colours, in a few words; empty for the colours themselves."""
 
 
 class Drawn(NamedTuple):
@@ -50,7 +50,7 @@ class Layer(NamedTuple):
     """A way of looking at a view."""
 
     wants: frozenset[str]
-    """What it needs of the renderer, see :class:`minisplat_ref.rendering.Request`."""
+    """The outputs that it needs of the renderer, see :class:`minisplat_ref.rendering.Request`."""
     picture: Callable[[Drawn], Picture]
     channel: str = "rgb"
     """That the renderer must have."""
@@ -71,7 +71,7 @@ def _alpha(drawn: Drawn) -> Picture:
 
 
 def _transmittance(drawn: Drawn) -> Picture:
-    """Show 1 - alpha in powers of ten: what lies behind is seen by this factor."""
+    """Show 1 - alpha in powers of ten: the factor by which the background is visible."""
     left = np.maximum(1 - drawn.output.alpha, 1e-4)  # [H, W]; where the compositor stops
     return Picture(
         colorize(np.log10(left), -4.0, 0.0, "magma"), "light that passes: dark 0.0001, bright 1 (logarithmic)"
@@ -85,7 +85,7 @@ def _normal(drawn: Drawn) -> Picture:
 
 
 def _importance(drawn: Drawn) -> Picture:
-    """Show how much the Gaussian that dominates a pixel weighs in the whole view, ``sum w`` over its pixels."""
+    """Show the weight in the whole view of the Gaussian that dominates a pixel, ``sum w`` over its pixels."""
     ids = drawn.stats.dominant_ids
     weights = np.append(drawn.stats.blend_weight_sum, 0)[ids]  # [H, W]; id -1 gets 0
     highest = float(weights.max(initial=0.0))
@@ -145,7 +145,7 @@ def draw(trained: Trained, camera: Camera, layer: str, time: float = 0.0) -> Pic
     Raises
     ------
     InputError
-        The renderer does not have what the layer shows.
+        The renderer does not have the channel that the layer shows.
     """
     wants = LAYERS[layer].wants
     settings = RenderSettings(
@@ -171,7 +171,7 @@ def find_bins(tape: Any) -> TileBins | None:
 
 
 def tile_loads(bins: TileBins) -> Ints:
-    """Return for each pixel [H, W] how many Gaussians its tile lists."""
+    """Return for each pixel [H, W] the number of Gaussians in its tile's list."""
     grid = bins.grid
     loads = np.diff(bins.tile_offsets).reshape(grid.n_tiles_y, grid.n_tiles_x)
     tiles = loads.repeat(grid.tile_height, axis=0).repeat(grid.tile_width, axis=1)

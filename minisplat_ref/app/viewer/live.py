@@ -19,9 +19,9 @@ SECONDS = 3.0  # between frames of the same view, which take time from the train
 
 
 def make_live_view(server: Any) -> Callable[[Path, Scene, Settings, Progress], Callable[[StepReport], None]]:
-    """Return what :func:`minisplat_ref.app.runs.run.run_training` takes to show a training in the browsers of a server.
+    """Return the arguments with which :func:`minisplat_ref.app.runs.run.run_training` shows a training in browsers.
 
-    Frames are drawn between two iterations: at once while a camera moves, every few seconds of what it rests on. The
+    Frames are rendered between two iterations: at once while a camera moves, every few seconds while it rests. The
     clock of the training stops still meanwhile, and the training ends with the same bytes as without.
     """
 

@@ -1,6 +1,6 @@
 """One file to send: a page that shows Gaussians in any browser with WebGL 2, without a network and without a server.
 
-``page.html`` is the page, ``page.js`` draws. The Gaussians are in it as gzip in base64, in this order:
+``page.html`` is the page, ``page.js`` renders. The Gaussians are in it as gzip in base64, in this order:
 
 ========== ========================================================================
 centres    3 x float32, in the frame in which the model was trained
@@ -12,7 +12,7 @@ harmonics  3 (K - 1) x int8 in steps of one 127th of the largest absolute coeffi
 ========== ========================================================================
 
 We wrote a viewer of our own, as the bundled ones weigh 3.3 MB (SuperSplat's) and 2.7 MB besides three.js (Spark).
-It draws what the profile GSPLAT_MAIN defines: opacities, colours, low-pass and bounds are those of ``render``, blended
+It renders under the profile GSPLAT_MAIN: opacities, colours, low-pass and bounds are those of ``render``, blended
 in half floats. Left out are early termination, lenses, and whatever an extension adds to the six fields of 3DGS.
 """
 
@@ -50,7 +50,7 @@ def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], b
     gaussians : Gaussians
         float32 or float64; N may be 0.
     cameras : sequence of Viewpoint
-        Where the viewer can stand, in the frame of the Gaussians; the first is shown first. Without any, a circle.
+        Cameras that the viewer offers, in the frame of the Gaussians; the first is shown first. Without any, a circle.
     background : ndarray of shape (3,)
         RGB in [0, 1].
 
@@ -92,7 +92,7 @@ def _view(view: Viewpoint) -> dict[str, Any]:
 
 
 def pack(gaussians: Gaussians) -> tuple[dict[str, Any], bytes]:
-    """Return what a page says about its arrays, and the arrays, packed by gzip.
+    """Return a page's description of its arrays, and the arrays, packed by gzip.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ def thumbnails(scene: Scene) -> dict[str, Image8]:
 
 
 def camera_scale(cameras: Sequence[Viewpoint]) -> float:
-    """Return how large cameras are shown, world units: by how far they lie apart, 1 where they do not."""
+    """Return the size at which cameras are shown, world units: by the distances between them, 1 where these are 0."""
     centres = np.array([view.camera.center for view in cameras])  # [V, 3]
     spread = math.sqrt(float(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return SCALE * (spread or 1.0)

@@ -1,4 +1,4 @@
-"""Where the camera of a viewer is, how that becomes a :class:`Camera`, and the path of a film through several.
+"""The pose of a viewer's camera, its conversion to a :class:`Camera`, and the path of a film through several poses.
 
 The field of view is that of the vertical, as browsers have it; pixels are square and the principal point is central, so
 that a training camera is shown with its vertical field of view and without its lens.
@@ -17,7 +17,7 @@ from minisplat_ref.io.orbits import common_up, nearest_to_axes, orbit
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.types import Camera, Floats
 
-NEAREST_TARGET = 1e-3  # of the distance to the scene's middle: what is turned about is in front of the camera
+NEAREST_TARGET = 1e-3  # of the distance to the scene's middle: the orbit centre is in front of the camera
 
 
 class Pose(NamedTuple):
@@ -34,7 +34,7 @@ class Pose(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What a browser shows first, and what it turns about."""
+    """Initial camera and orbit centre of the viewer."""
 
     pose: Pose
     target: Floats
@@ -60,7 +60,7 @@ def pose_of(camera: Camera, time: float = 0.0) -> Pose:
 
 
 def start_at(means: Floats, cameras: Sequence[Viewpoint]) -> Start:
-    """Return where a viewer starts: at the first camera, or without any where ``render`` starts its circle.
+    """Return the start of a viewer: the first camera, or without any the start of the circle of ``render``.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How large the next frame of a viewer is: small while the camera moves, then as large as was asked for."""
+"""The size of a viewer's next frame: small while the camera moves, then as large as requested."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ SHORTEST = 16  # pixels of a side
 
 
 class Wanted(NamedTuple):
-    """What a browser is to show."""
+    """The content that a browser should show."""
 
     pose: Pose
     layer: str
@@ -24,7 +24,7 @@ class Wanted(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """What a browser shows."""
+    """The content that a browser shows."""
 
     wanted: Wanted | None = None
     divisor: int = 0
@@ -45,7 +45,7 @@ def reduced(width: int, height: int, divisor: int) -> tuple[int, int]:
 
 
 def coarse_divisor(wanted: Wanted, pixel_seconds: float | None) -> int:
-    """Return the smallest divisor with which a frame is drawn in time; the largest where none is.
+    """Return the smallest divisor with which a frame is rendered in time; the largest where none is.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def coarse_divisor(wanted: Wanted, pixel_seconds: float | None) -> int:
 def next_divisor(
     wanted: Wanted, version: int, shown: Shown, still_seconds: float, pixel_seconds: float | None
 ) -> int | None:
-    """Return the divisor of the next frame; None where there is nothing to draw, or not yet.
+    """Return the divisor of the next frame; None where there is nothing to render, or not yet.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def next_divisor(
     if wanted != shown.wanted:
         return coarse_divisor(wanted, pixel_seconds)
     if version != shown.version:
-        return shown.divisor  # a training does not blur what is looked at
+        return shown.divisor  # a training does not blur a view at rest
     if shown.divisor == 1 or still_seconds < SETTLED_SECONDS:
         return None
     return max(1, shown.divisor // FINER)

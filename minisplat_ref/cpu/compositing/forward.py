@@ -50,7 +50,7 @@ MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 
 
 class HitStats(NamedTuple):
-    """Output about the hits; arrays that are not asked for are empty."""
+    """Output about the hits; arrays that are not requested are empty."""
 
     slots: Floats
     """[M, 3] sum of the weights, largest weight and number of hits of each pair, by slots."""

@@ -1,4 +1,4 @@
-"""Blend any primitives: the functions around the plain kernels, twins of the reference's of the same names."""
+"""Blend any primitives: the functions around the plain kernels, named as their counterparts in the reference."""
 
 from typing import Any
 

@@ -23,8 +23,8 @@ each hit subtracts its share. No two threads write to one slot, and slots are su
 gradient do not depend on the number of threads.
 
 The functions around these kernels are in :mod:`minisplat_ref.cpu.compositing.hits`. Where pixels sort their hits
-(``buffer_size`` above 1), :mod:`minisplat_ref.cpu.compositing.hit_buffer` runs over the list. Left out: what makes the
-tuned kernels (``forward``, ``backward``) faster, and blend statistics.
+(``buffer_size`` above 1), :mod:`minisplat_ref.cpu.compositing.hit_buffer` runs over the list. Left out: the
+optimisations of the tuned kernels (``forward``, ``backward``), and blend statistics.
 """
 
 import functools

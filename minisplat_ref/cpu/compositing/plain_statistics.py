@@ -1,4 +1,4 @@
-"""Blend statistics of any primitive: the loop of :mod:`.plain`, which adds up weights in place of colours.
+"""Blend statistics of any primitive: the loop of :mod:`.plain`, which sums weights instead of colours.
 
 A pair is a primitive in one tile. Only the thread of the tile writes its numbers and pixels, so the sums over pairs,
 which NumPy takes in the order of the lists, have the same bytes at any number of threads::
@@ -7,7 +7,7 @@ which NumPy takes in the order of the lists, have the same bytes at any number o
     changes [M]      | squared change of the image without it |
     state of a row   | T | largest w | its index in the list | its depth | median depth |     eight numbers each
 
-Where pixels sort their hits, a hit's depth takes the place of its channels in the buffer of :mod:`.hit_buffer`.
+Where pixels sort their hits, a hit's depth replaces its channels in the buffer of :mod:`.hit_buffer`.
 """
 
 import functools

@@ -1,9 +1,9 @@
-"""Responses for the plain kernels: what a primitive does to a pixel, as formulas on lanes over a row of numbers.
+"""Responses for the plain kernels: a primitive's alpha at a pixel, as formulas on lanes over a row of numbers.
 
 The reference describes a response as functions of whole arrays (``reference.hits``); here each is a ``scalar`` function
 of one primitive and eight pixels. A kernel never sees the primitive itself: it reads the row that ``records`` made of
 it, and returns the gradient with respect to the first numbers of that row, which ``records_vjp`` converts to one with
-respect to the primitive. What a ray depends on of the camera is in the record too: the direction of a pixel's ray is
+respect to the primitive. The record also has the camera's terms of a ray: the direction of a pixel's ray is
 linear in (x, y, 1).
 
 The conic, a flat ellipse in the image, is the first response and that of 3DGS. Its record holds the conic as factors:

@@ -1,7 +1,7 @@
-"""Which part of a tile a Gaussian reaches, and its alpha there.
+"""The part of a tile that a Gaussian reaches, and its alpha there.
 
 The rows that the visible ellipse reaches are found strip by strip, so that a slanted ellipse covers a staircase of rows
-rather than its box. What all pixels of a line share is computed once, for all lines of the tile together.
+rather than its box. Terms that all pixels of a line share are computed once, for all lines of the tile together.
 
 Alpha is computed for all rows before any is blended. The exponential is a long chain of dependent operations, and
 blending is another. A processor hides their latency by executing other pixels out of order, and its window spans more
@@ -68,7 +68,7 @@ def start_scratch(scratch):
 
 @scalar
 def write_lines(scratch, mx, my, slope, half_pivot):
-    """Write what all pixels of a line share: with e = dx + slope dy, sigma is (a e^2 + pivot dy^2) / 2.
+    """Write the terms that all pixels of a line share: with e = dx + slope dy, sigma is (a e^2 + pivot dy^2) / 2.
 
     On each line it is least at mx + slope dy, and e is the distance from there.
     """
@@ -101,7 +101,7 @@ def sigma_of(scratch, row, half_a):
 def find_reached_rows(records, ids, m, x0, y0):
     """Return as bits the rows of eight pixels that the visible ellipse of the tile's m-th Gaussian reaches.
 
-    It computes eight bounds at once: how far the ellipse reaches up and down in each of the four strips. A kernel calls
+    It computes eight bounds at once: the extent of the ellipse up and down in each of the four strips. A kernel calls
     it one Gaussian ahead: while the one before is blended, the record is fetched and the root computed.
     """
     if m >= ids.size:

@@ -127,7 +127,7 @@ def corner(tile, frame):
 
 @scalar
 def row_in_image(row, x0, y0, frame):
-    """Return column and line of a row's first pixel, and how many of its eight pixels lie in the image."""
+    """Return column and line of a row's first pixel, and the number of its eight pixels that lie in the image."""
     x, y = x0 + row // TILE_HEIGHT * WIDTH, y0 + row % TILE_HEIGHT
     return x, y, max(0, min(WIDTH, frame.width - x)) if y < frame.height else 0
 

@@ -17,7 +17,7 @@ class LossTape(NamedTuple):
 
 
 def _counts(mask: Bools | None, width: int, dtype: np.dtype) -> Floats:
-    """Return 1 for numbers that count and 0 for others [H, L]; without a mask, one row stands for all."""
+    """Return 1 for numbers that count and 0 for others [H, L]; without a mask, one row for all."""
     counts = np.zeros((1 if mask is None else len(mask), row_length(width)), dtype)
     counts[:, : 3 * width] = 1 if mask is None else np.repeat(mask, 3, axis=1)
     return counts

@@ -6,11 +6,11 @@ it is in the cache. Numbers of a row that have the same weight are added first.
 
 A window needs eleven rows of both images, and the gradient of a row needs the derivatives of SSIM in the eleven rows
 around it. Both are kept in ring buffers of rows, which stay in the cache, instead of five more images in memory: so the
-gradient, up to a factor, is computed together with the loss. Rows are filtered vertically two at a time, so that what
-two windows share is read once; a ring has twelve rows. Each thread works down a band of rows, and computes the rows
-beyond its edges redundantly. The first of two rows is rounded differently from the second, because the compiler
-contracts other products. So a band begins at an even row, and with it every pair for the gradient; pairs for the
-similarity begin at odd rows.
+gradient, up to a factor, is computed together with the loss. Rows are filtered vertically two at a time, so that the
+rows that two windows share are read once; a ring has twelve rows. Each thread works down a band of rows, and computes
+the rows beyond its edges redundantly. The first of two rows is rounded differently from the second, because the
+compiler contracts other products. So a band begins at an even row, and with it every pair for the gradient; pairs for
+the similarity begin at odd rows.
 
 Rows of the images get margins that represent black, wide enough for the window and for the last eight numbers of a row,
 so that no number is a special case. One half is subtracted, and moments are those of I - 1/2 and T - 1/2: variances are

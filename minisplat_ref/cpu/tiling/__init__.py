@@ -1,8 +1,8 @@
 """Lists of the Gaussians that touch each tile, front to back.
 
 The pairs (tile, Gaussian) are never sorted. The Gaussians are split by depth into layers of about equal numbers, each
-behind the one before. The counts of each layer's pairs in each tile tell where in the tile's list they start, so that
-the layers can be sorted by depth and written into the lists independently. There are three passes:
+behind the one before. The counts of each layer's pairs in each tile determine where in the tile's list they start, so
+that the layers can be sorted by depth and written into the lists independently. There are three passes:
 
 1. The survey makes a histogram of depths for each part of the input, which says where layers begin, and finds the wide
    boxes.

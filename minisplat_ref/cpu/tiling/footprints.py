@@ -1,4 +1,4 @@
-"""Which tiles each Gaussian reaches.
+"""The tiles that each Gaussian reaches.
 
 A box of pixels within one row or one column of tiles reaches all of these tiles, nearly always one or two. Only for a
 wide box, over several rows and several columns, is the visible ellipse tested against the tiles: that drops most of the

@@ -18,7 +18,7 @@ from minisplat_ref.types import Ints
 
 N_PARTS = 16  # of the input, and as many layers
 BUCKET_SHIFT = 18  # of the bits of a float32: 32 buckets of depth per factor of two
-N_BUCKETS = 1 << 10  # from 1/128 to 2^25; the first and the last also hold what lies beyond
+N_BUCKETS = 1 << 10  # from 1/128 to 2^25; the first and the last also hold all depths beyond
 FIRST_BUCKET = int(np.float32(1 / 128).view(np.int32)) >> BUCKET_SHIFT
 CULLED = N_BUCKETS  # the bucket behind them all
 GAUSSIANS, TILES = 0, 1  # columns of a count; the tiles are those under boxes

@@ -1,7 +1,7 @@
 """Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by COLMAP.
 
 Photographs are rotated upright and shrunk (:mod:`.photographs`), features are found and matched (:mod:`.features`), two
-mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. What is left is a COLMAP
+mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. The result is a COLMAP
 scene with pinhole cameras: ``images/``, ``sparse/0/``, and ``masks/`` if there were masks. Photographs that could not
 be placed are named and left out.
 """
@@ -59,7 +59,7 @@ class SfmResult(NamedTuple):
 
 
 def default_matching(photos: Path) -> str:
-    """Return how photographs are matched unless told otherwise: the frames of a video with their neighbours."""
+    """Return the default matching: for the frames of a video, with their neighbours."""
     return "sequential" if is_video(photos) else "exhaustive"
 
 
@@ -180,7 +180,7 @@ def _check_placed(best: Mapped, n_photos: int, photos: Path, matching: str) -> N
 
 
 def advice(matching: str) -> str:
-    """Return what usually helps photographs that could not be placed after this kind of matching."""
+    """Return the usual remedy for photographs that could not be placed after this kind of matching."""
     if matching == "sequential":
         return (
             "--matching sequential compares neighbours in the order of file names, which suits frames of a video; for"

@@ -2,7 +2,7 @@
 
 SIFT, by COLMAP, on the CPU. *Standard* is COLMAP's own setting. *Dense* finds weaker features, and more of them, and
 searches once more along the epipolar lines of pairs that match. That takes some twenty times as long, so it is done
-only between photographs whose standard features say that they overlap. Photographs and pairs are handed over in
+only between photographs that overlap according to their standard features. Photographs and pairs are handed over in
 batches: between them the progress bar moves, and an interruption is noticed.
 """
 
@@ -28,7 +28,7 @@ Pair = tuple[str, str]
 
 
 class Features(NamedTuple):
-    """How features are found and matched."""
+    """Settings of finding and matching features."""
 
     name: str
     """As ``--features`` calls it."""

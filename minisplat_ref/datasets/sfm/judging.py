@@ -1,11 +1,10 @@
-"""Choose among the models that mappers and features have given.
+"""Choose among the models of several mappers and features.
 
 A wrong model may place all photographs, have more points than a right one and a smaller reprojection error: the global
-mapper gave one of 50 photographs of a fox before a wallpaper that repeats, with half of the cameras far off. What
-contradicts it are the matches: features that two photographs share lie off each other's epipolar lines if a pose is
-wrong. So the matches are counted that a model explains; for all models the same ones, of the densest features that were
-tried. A photograph without a place explains none. Among models that explain nearly as many, the one with more points is
-better.
+mapper gave one of 50 photographs of a fox before a wallpaper that repeats, with half of the cameras far off. The
+matches contradict it: features that two photographs share lie off each other's epipolar lines if a pose is wrong. So
+the matches are counted that a model explains; for all models the same ones, of the densest features that were tried. A
+photograph without a place explains none. Among models that explain nearly as many, the one with more points is better.
 """
 
 from collections.abc import Sequence
@@ -50,7 +49,7 @@ def read_matches(database: Path) -> list[Matches]:
 
 
 def count_explained(model: Any, pairs: Sequence[Matches]) -> int:
-    """Return how many matches lie within DISTANCE_MAX of the epipolar lines of a model's cameras.
+    """Return the number of matches within DISTANCE_MAX of the epipolar lines of a model's cameras.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ MAPPERS = ("incremental", "global")
 
 
 class Mapped(NamedTuple):
-    """What one mapper made of the matches."""
+    """The result of one mapper."""
 
     mapper: str
     """Its name."""

@@ -1,7 +1,7 @@
 """Prepare photographs for structure from motion: upright and shrunk copies, their masks, and which share a camera.
 
-Photographs share a camera if size, make, model and focal length agree: another zoom setting is another camera. What the
-EXIF data do not say counts as equal. Copies keep the focal length, COLMAP's initial value; location and time are left
+Photographs share a camera if size, make, model and focal length agree: another zoom setting is another camera. Values
+that the EXIF data lack count as equal. Copies keep the focal length, COLMAP's initial value; location and time are left
 out. An alpha channel is a mask, and so is a file in ``masks/`` beside the photographs, as COLMAP names it
 (``0001.jpg.png``) or by the name alone (``0001.png``).
 """
@@ -34,7 +34,7 @@ FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 
 
 class Group(NamedTuple):
-    """What photographs of one camera have in common, of their copies and from their EXIF data."""
+    """Properties that photographs of one camera share, of their copies and from their EXIF data."""
 
     width: int
     """Pixels."""

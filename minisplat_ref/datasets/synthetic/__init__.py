@@ -27,7 +27,7 @@ class SyntheticScene(NamedTuple):
     """A scene with the truth that photographs lack, with V training and T test views."""
 
     scene: Scene
-    """What a loader would return."""
+    """The scene as a loader would return it."""
     train_depths: Floats
     """[V, H, W] float64 camera z at pixel centres, world units; 0 at the sky."""
     test_depths: Floats

@@ -166,7 +166,7 @@ def _camera_line(camera: Camera) -> str:
 
 
 def _image_lines(image_id: int, view: View, point_ids: Ints, points: Floats) -> str:
-    """Return COLMAP's two lines for a view: its pose (quaternion wxyz, translation); x, y, point id of what it sees."""
+    """Return COLMAP's two lines for a view: its pose (quaternion wxyz, translation); x, y, id of its points."""
     x, y, z, w = Rotation.from_matrix(view.camera.cam_from_world_R).as_quat()
     pose = _numbers([w, x, y, z, *view.camera.cam_from_world_t])
     pixels, _ = project_points(view.camera, points[point_ids])

@@ -113,7 +113,7 @@ class _Placement(NamedTuple):
         return place(Cylinder(radius, 0.5 * length), look, middle, self.rotation @ _frame_along(axis / length))
 
     def thin_rod(self, start: list[float], end: list[float], radius: float, look: Texture | Material) -> Primitive:
-        """A rod without a shadow: under a lamp this wide it is too faint to see, but four samples would draw lines."""
+        """A rod without a shadow: under a lamp this wide it is too faint to see, but four samples would leave lines."""
         return self.rod(start, end, radius, look)._replace(casts_shadow=False)
 
 

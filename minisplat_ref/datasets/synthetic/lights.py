@@ -28,7 +28,7 @@ def light_square(centre: Floats, half: float) -> Floats:
 
 
 def daylight(primitives: Sequence[Primitive], lattice: Floats) -> World:
-    """Put things under the sun and a sky with clouds, whose noise is of a lattice."""
+    """Put things under the sun and a sky with clouds of lattice noise."""
     sun = np.array([60.0, -35.0, 70.0])
     return World(
         primitives=tuple(primitives),

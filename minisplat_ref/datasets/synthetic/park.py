@@ -83,7 +83,7 @@ def _looks(lattice: Floats) -> list[Texture]:
 
 
 def _square(corner: Floats, looks: list[Texture], rng: np.random.Generator) -> list[Primitive]:
-    """Put things on a square, each into a cell of its own."""
+    """Put things on a square, each into a separate cell."""
     cells = rng.permutation(9)[:N_THINGS]
     things = []
     for cell in cells.tolist():

@@ -1,8 +1,8 @@
 """Synthetic scenes, stage 7: four worlds to render, and the list of all. Metres, z up, the floor at z = 0.
 
 ``room``: textured walls, furniture with thin rods, spheres and boxes. ``plain-wall``: walls without any texture fill
-most of the image. ``glossy``: polished things, whose look changes with the viewpoint. ``outdoor``: open ground with a
-few objects under a sky that has no depth.
+most of the image. ``glossy``: polished things, whose appearance changes with the viewpoint. ``outdoor``: open ground
+with a few objects under a sky that has no depth.
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ def room(rng: np.random.Generator) -> Setting:
 
 
 def plain_wall(rng: np.random.Generator) -> Setting:
-    """The same room with bare walls: a photograph says nothing about where such a wall is."""
+    """The same room with bare walls: a photograph does not reveal where such a wall is."""
     lattice = random_lattice(rng)
     bare = Plain("#e4d8c6")
     streaks = Noise("#000000", "#ffffff", np.array([0.9, 0.06, 1.0]), lattice)

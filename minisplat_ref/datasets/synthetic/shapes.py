@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 1: where a ray meets a rectangle, box, sphere or capped cylinder, in closed form.
+"""Synthetic scenes, stage 1: intersections of rays with rectangles, boxes, spheres and cylinders, in closed form.
 
 A ray is ``origin + t * direction`` with a direction of any length; an intersection is the least t > 0, infinity where
 there is none. Every shape lies in its own frame, centred at 0 and aligned with the axes. No triangle meshes.

@@ -72,8 +72,8 @@ def sample_points(
     """
     weights = np.stack([_feature_weights(view) for view in traced]).ravel()  # [V H W]
     pixels = np.flatnonzero(weights)
-    # The least of several exponential variates is each with probability proportional to its rate, so sorting the
-    # variates draws without replacement.
+    # Each of several exponential variates is the smallest with probability proportional to its rate, so sorting them
+    # draws without replacement.
     pixels = pixels[np.argsort(rng.exponential(size=len(pixels)) / weights[pixels])]
     batches = [SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(cameras), 0), bool))]
     n_missing = n_points
@@ -101,7 +101,7 @@ def project_points(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
 
 
 def _feature_weights(view: TracedView) -> Floats:
-    """Return how likely [H, W] a feature detector responds at a pixel; 0 at the sky."""
+    """Return the likelihood [H, W] that a feature detector responds at a pixel; 0 at the sky."""
     grey = view.image.mean(axis=2)
     gradient = np.hypot(*np.gradient(grey))
     return np.where(view.depth > 0, np.maximum(gradient - GRADIENT_MIN, 0.0) + BARE_WEIGHT, 0.0)

@@ -1,7 +1,7 @@
-"""The true surface of a synthetic scene, and how far Gaussians are from it: the Chamfer distance.
+"""The true surface of a synthetic scene, and the Chamfer distance of Gaussians from it.
 
-Of a folder that ``minisplat-ref synthetic`` has written, the depth of every pixel is known. What the training views'
-pixels show are points of the true surface, dense where the views look long or closely.
+Of a folder that ``minisplat-ref synthetic`` has written, the depth of every pixel is known. The training views' pixels
+show points of the true surface, which are dense where many views look, or from near by.
 """
 
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ def true_surface(folder: Path, scene: Scene) -> Surface | None:
 
 
 def surface_near(points: Floats, cameras: Sequence[Camera], extent: float) -> Surface | None:
-    """Return the surface of what is near the cameras of points [P, 3]; None if nothing is."""
+    """Return the surface near the cameras, of points [P, 3]; None if nothing is."""
     centre = np.mean([camera.center for camera in cameras], axis=0)  # [3]
     points = points[_is_near(points, centre, extent)]
     if len(points) > POINTS_MAX:

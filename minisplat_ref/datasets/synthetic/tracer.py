@@ -47,7 +47,7 @@ class World(NamedTuple):
     ambient_below: Floats
     """[3] linear RGB that reaches a surface facing down."""
     sky: Callable[[Floats], Floats] | None
-    """Unit directions [n, 3] -> linear RGB [n, 3] of what lies at infinity; None where the world is closed."""
+    """Unit directions [n, 3] -> linear RGB [n, 3] of the light from infinity; None where the world is closed."""
 
 
 class TracedView(NamedTuple):
@@ -69,7 +69,7 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     Parameters
     ----------
     world : World
-        What to look at; +z is up for its ambient light.
+        The scene; +z is up for its ambient light.
     camera : Camera
         From where.
     supersampling : int

@@ -33,7 +33,7 @@ N_BLOCKS, BLOCK, STREET = 4, 0.3, 0.14
 
 
 class Path(Protocol):
-    """Where the photographer goes."""
+    """The path of the photographer."""
 
     def cameras(self, n_cameras: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
         """Return cameras in walking order, float64."""
@@ -47,7 +47,7 @@ class Setting(NamedTuple):
     path: Path
     """The camera path."""
     point_noise: float = 0.0
-    """Standard deviation of the error of each sparse point's coordinates, metres, unless asked otherwise."""
+    """Standard deviation of the error of each sparse point's coordinates, metres, by default."""
 
 
 def staircase(rng: np.random.Generator) -> Setting:
@@ -71,7 +71,7 @@ def noisy_sphere(rng: np.random.Generator) -> Setting:
 
 
 def facing_spheres(rng: np.random.Generator) -> Setting:
-    """Two balls, nearly touching: what one hides of the other is seen from the sides alone."""
+    """Two balls, nearly touching: the part of one that the other hides is seen only from the sides."""
     lattice = random_lattice(rng)
     marble = Noise("#7a2848", "#f2c48d", np.full(3, 0.2), lattice, contrast=2.2)
     x = 0.4 + 0.5 * GAP

@@ -1,7 +1,7 @@
 """Analytic splatting: alpha is a mean over the pixel, not the value at its centre.
 
 This follows Analytic-Splatting, Liang et al. 2024, arXiv 2403.11056. A pixel collects light from a square. 3DGS takes
-the value of the footprint at its centre, which misses what is thinner than a pixel; hence its low-pass. Here alpha is
+the value of the footprint at its centre, which misses anything thinner than a pixel; hence its low-pass. Here alpha is
 the integral over the square, in closed form, without a low-pass (:mod:`minisplat_ref.extensions.analytic.reference`):
 
     alpha = o 2 pi l_1 l_2 prod_k [F((u_k + 1/2) / l_k) - F((u_k - 1/2) / l_k)]

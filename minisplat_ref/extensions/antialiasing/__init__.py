@@ -20,8 +20,8 @@ measured. A recipe of the core that is trained with
 ``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a Gaussian
 over a pixel, is the extension ``analytic``; ``docs/FAMILY.md`` has the figures of both.
 
-A viewer of 3DGS knows neither filter. ``fuse`` (:mod:`minisplat_ref.extensions.antialiasing.fuse`) writes s' and o' in
-the place of s and o, a PLY of six fields.
+A viewer of 3DGS has neither filter. ``fuse`` (:mod:`minisplat_ref.extensions.antialiasing.fuse`) writes s' and o'
+instead of s and o, a PLY of six fields.
 
     minisplat-ref train SCENE --recipe antialiasing --out runs/fine
     minisplat-ref antialiasing fuse runs/fine fine.ply

@@ -55,7 +55,7 @@ def apply_filters(g: FilteredGaussians) -> Gaussians:
 
 
 def with_3d_filter(inner: Renderer) -> Renderer:
-    """Return a renderer that filters the Gaussians in space before ``inner`` draws them."""
+    """Return a renderer that filters the Gaussians in space before ``inner`` renders them."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
         output, tape = inner.render(model._replace(gaussians=apply_filters(model.gaussians)), view, request)

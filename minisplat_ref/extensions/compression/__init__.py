@@ -1,7 +1,7 @@
-"""Compression: compact files of Gaussians, and what their bytes cost in quality.
+"""Compression: compact files of Gaussians, and the loss of quality at their sizes.
 
-No single paper is followed. This extension does what all compact formats of 3DGS do: it sorts the Gaussians so that
-neighbours are alike, quantises each field as its meaning allows, and leaves the rest to an entropy coder.
+No single paper is followed. Like all compact formats of 3DGS, this one sorts the Gaussians so that neighbours are
+similar, quantises each field according to its meaning, and leaves the rest to an entropy coder.
 
 ``.msz`` (:mod:`minisplat_ref.extensions.compression.msz`) is the format of this project. Gaussians are in Morton order,
 and every field is rounded to a lattice whose step is a power of two,
@@ -17,8 +17,9 @@ are stored together, and zstandard packs them. There are 13 levels; level 0 keep
     python -m data_tools.claims compression/rate-distortion SCENE --out DIR
 
 The order of the Gaussians is not preserved; only ties in depth depend on it. Quaternions come back with another length,
-which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that draws
-these six in its own way is recorded in the header. Other programs' formats are in :mod:`minisplat_ref.io.formats`.
+which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that
+renders these six in another way is recorded in the header. Other programs' formats are in
+:mod:`minisplat_ref.io.formats`.
 
 Left out are pruning, merging and training with the quantiser in the loop, which gain more than any entropy coder;
 vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.md`` has the measured figures.

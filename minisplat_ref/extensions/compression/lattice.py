@@ -3,7 +3,7 @@
 A value x becomes the integer ``q = rint(x / step)`` and comes back as ``q step``, so ``|q step - x| <= step / 2``. With
 ``step = 2^e`` this bound is exact, because dividing by a power of two is exact. If x is a float32, so is the result:
 where ``|q| <= 2^24`` it has 24 bits, and where ``|q|`` is larger, adjacent float32 numbers are further apart than the
-lattice, so x is on it. A value on the lattice stays where it is, hence encoding what was decoded gives the same
+lattice, so x is on it. A value on the lattice stays where it is, hence encoding decoded values again gives the same
 integers.
 
 A quaternion q, whose length has no meaning, is divided by its largest component. That becomes 1, the others are in
@@ -51,7 +51,7 @@ def to_lattice(values: Floats, exponent: int, name: str) -> Ints:
 
 def from_lattice(integers: Ints, exponent: int) -> Floats:
     """Return ``q 2^e`` as float32."""
-    with np.errstate(over="ignore"):  # of damaged files, whose values are checked to be finite
+    with np.errstate(over="ignore"):  # of damaged files; values are checked to be finite
         return np.ldexp(integers.astype(np.float64), exponent).astype(np.float32)
 
 

@@ -16,7 +16,7 @@ from minisplat_ref.types import Ints
 
 N_LEVELS = 13
 DEFAULT = 5
-SMALL = 0.1  # quantile of the Gaussians' middle standard deviations that stands for the small ones
+SMALL = 0.1  # quantile of the Gaussians' middle standard deviations that represents the small ones
 
 
 class Exponents(NamedTuple):
@@ -32,7 +32,7 @@ class Exponents(NamedTuple):
     sh_rest: int
 
 
-# Chosen so that at level 8 each field by itself costs less than 0.03 dB in a short training of a phone video. Higher
+# Chosen so that at level 8 each field alone costs less than 0.03 dB in a short training of a phone video. Higher
 # harmonics need the finest step, because the errors of all 45 add up in one colour.
 FINEST = Exponents(means=-7, quats=-10, log_scales=-8, opacity_logits=-6, sh_dc=-8, sh_rest=-9)
 """Of level 1."""

@@ -7,7 +7,7 @@ exponent of its step and the number of its planes; half a step bounds the error.
 - ``largest`` and ``quats``: see :mod:`minisplat_ref.extensions.compression.lattice`;
 - ``log_scales``, ``opacity_logits``, ``sh_dc``, ``sh_rest``: one column for each number.
 
-At level 0 each field is a stream of the bit patterns of its float32. Encoding what was decoded gives the same file,
+At level 0 each field is a stream of the bit patterns of its float32. Encoding a decoded file again gives the same file,
 byte for byte: the order, too, depends on lattice points alone, and Gaussians of one cell stay in their order.
 """
 

@@ -1,8 +1,8 @@
 """CUS-GS: voxels that decode several Gaussians each, and read their features in a memory.
 
-This follows CUS-GS, 2025, arXiv 2511.17904. What 3DGS stores for each Gaussian, and feature fields store once more,
-an anchor stores for the K Gaussians of a voxel: a latent z of few numbers and their offsets. Networks that all anchors
-share make of it opacity, scales, rotation, colour and a query (:mod:`.decoding`):
+This follows CUS-GS, 2025, arXiv 2511.17904. 3DGS stores appearance for each Gaussian, and feature fields store features
+besides; here an anchor stores both for the K Gaussians of a voxel: a latent z of few numbers and their offsets.
+Networks that all anchors share make of it opacity, scales, rotation, colour and a query (:mod:`.decoding`):
 
     mu_n = m + dx_n,   (o, s, q, c)_n = networks(z, d, e),   k_n = [query(z, d, e), dx_n / s] A + b
 
@@ -32,12 +32,12 @@ it maps are classical: colours and the energies of Gabor filters at three scales
 ``docs/FAMILY.md`` has the measured figures. A run keeps networks, embeddings and memory in ``shared.npz``; a PLY has
 the anchors, which other viewers show as one Gaussian each.
 
-This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical, and
-nothing is said of meaning. Networks add to what an anchor begins with, which is the colour of its points; their last
-layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points, instead of
-0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have different units
-and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights, gamma and rates
-are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
+This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical,
+without any claim about meaning. Networks add to the initial values of an anchor, such as the colour of its points;
+their last layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points,
+instead of 0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have
+different units and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights,
+gamma and rates are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
 
 Left out: the language model, and the pruning of anchors by opacity, which in Scaffold-GS accompanies their growing.
 """
@@ -54,7 +54,7 @@ from minisplat_ref.io.ply import save_ply
 
 
 def save(path: str | Path, gaussians: Any, label: Label) -> None:
-    """Write the anchors, and say in the header that the networks are missing."""
+    """Write the anchors, with a note in the header that the networks are missing."""
     save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
 
 

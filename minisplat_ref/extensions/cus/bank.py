@@ -1,10 +1,10 @@
-"""The memory of features, and how a pixel reads it: few remembered features in place of many stored ones.
+"""The memory of features, and its readout by a pixel: few features in the memory instead of many stored ones.
 
 The memory M [K, D] keeps a feature r of the photographs, one after the other, if it is like none that is kept::
 
     max_k (r . m_k) / (|r| |m_k|) < gamma
 
-A blended query q [d] reads it by attention, and an adapter W [D, D] maps what was read::
+A blended query q [d] reads it by attention, and an adapter W [D, D] maps the result::
 
     a = softmax(q (M P)^T / sqrt(d)),   f = (a M) W
 
@@ -20,7 +20,7 @@ import numpy as np
 from minisplat_ref.types import Floats
 
 ROWS_MAX = 512  # of the memory
-RANK_MIN = 1e-3  # of the largest singular value: what is below counts as nothing
+RANK_MIN = 1e-3  # of the largest singular value: smaller ones count as 0
 CHUNK = 1_024  # features that are compared with the memory at once
 
 
@@ -68,7 +68,7 @@ def first_keys(memory: Floats, n: int) -> Floats:
 
 
 class Reading(NamedTuple):
-    """What :func:`read` keeps for its gradient."""
+    """The values that :func:`read` keeps for its gradient."""
 
     queries: Floats
     memory: Floats
@@ -120,7 +120,7 @@ LENGTH_MIN = 1e-3  # of a feature, where the cosine would have no derivative
 
 
 def feature_error(found: Floats, target: Floats) -> tuple[float, Floats]:
-    """Return ``mean_p mean_c (f - t)^2 + mean_p (1 - cos(f, t))`` of features [B, D], and its derivative by f.
+    """Return ``mean_p mean_c (f - t)^2 + mean_p (1 - cos(f, t))`` of features [B, D], and its derivative v_f.
 
     ::
 

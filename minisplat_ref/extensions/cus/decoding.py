@@ -1,7 +1,7 @@
 """From anchors to Gaussians and their queries, and the gradient back.
 
 An anchor v at m_v with the latent z_v is seen from the direction d_v in the photograph c, of embedding e_c. Networks of
-one hidden layer of ReLUs read ``x_v = [z_v, d_v, e_c]``; their outputs join what the anchor has, before the activations
+one hidden layer of ReLUs read ``x_v = [z_v, d_v, e_c]``; their outputs join the anchor's fields, before the activations
 of 3DGS. For each n of K::
 
     mu_vn = m_v + dx_vn
@@ -29,12 +29,12 @@ Shared = Mapping[str, Floats]
 
 
 class Decoded(NamedTuple):
-    """The Gaussians of a view, and what their gradient needs."""
+    """The Gaussians of a view, and the values that their gradient needs."""
 
     gaussians: Gaussians
     """N K rows, those of an anchor one after another."""
     queries: Floats | None
-    """[N K, d] k; None if not asked for."""
+    """[N K, d] k; None if not requested."""
     model: Model
     view: View
     networks: Networks

@@ -11,9 +11,9 @@ A voxel gets an anchor at its centre if the mean gradient of the Gaussians in it
 yet, and if it survives a random elimination. At the third level voxels are as large as those of the first anchors,
 whose side is l.
 
-The paper gives no share of the random elimination; in its release a half, a quarter and an eighth go. It does not say
-what a new anchor begins with, either: here with latent and colour of the anchor whose Gaussian has the largest gradient
-in the voxel. Gradients are those of the photometric loss.
+The paper gives no share of the random elimination; in its release a half, a quarter and an eighth go. Nor does it
+define the start of a new anchor: here it has latent and colour of the anchor whose Gaussian has the largest gradient in
+the voxel. Gradients are those of the photometric loss.
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ SUM, COUNT = "children_gradient_sum", "children_view_count"
 def collect_gradients_of_children(state: TrainState, iteration: Iteration, *, growth_threshold: float | None) -> None:
     """Add the positional gradient of each Gaussian to ``stats[SUM]`` [N, K], and count the view in ``stats[COUNT]``.
 
-    A Gaussian without a gradient was not seen. Where nothing will grow, as there is no threshold, nothing is collected.
+    A Gaussian without a gradient was not seen. Without a threshold nothing grows, and nothing is collected.
     """
     if growth_threshold is None:
         return
@@ -108,7 +108,7 @@ def grow(anchors: Anchors, gradients: Floats, side: float, threshold: float, rng
     threshold : float
         tau.
     rng : numpy.random.Generator
-        Draws what is eliminated, and the offsets of the new anchors.
+        Draws the eliminated anchors, and the offsets of the new ones.
     """
     n, k = gradients.shape
     is_seen = ~np.isnan(gradients)
@@ -129,7 +129,7 @@ def grow(anchors: Anchors, gradients: Floats, side: float, threshold: float, rng
 def grow_anchors(
     state: TrainState, iteration: Iteration, *, voxel: float, growth_threshold: float | None
 ) -> str | None:
-    """Do :func:`grow` by the gradients collected since the last time, and collect anew.
+    """Apply :func:`grow` with the gradients collected since the last time, and reset them.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ UNIT = 0.01  # of the scene's extent: the side of voxels in the paper
 
 
 class FeatureTape(NamedTuple):
-    """What :func:`blended_queries` keeps for its gradient."""
+    """The values that :func:`blended_queries` keeps for its gradient."""
 
     decoded: Decoded
     blended: BlendTape

@@ -5,7 +5,7 @@ network; h and w may be smaller than the photograph's. Nothing is downloaded.
 
 Without a folder the map is that of :data:`~minisplat_ref.mechanisms.features.filters.CLASSICAL`: at each of its three
 scales the mean colours and the energies in four directions, and one constant, 22 numbers for each pixel. Signed
-responses are left out, since they change with the place of a stripe. These features know colours and textures, no
+responses are left out, since they change with the place of a stripe. These features describe colours and textures, not
 objects.
 """
 
@@ -78,7 +78,7 @@ def check_depths(n_channels: Mapping[str, int], folder: str) -> None:
 
 
 class _Photograph:
-    """An image, equal to another of the same pixels: what a cache asks for."""
+    """An image, equal to another of the same pixels, as the key of a cache."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
         self.image = image

@@ -23,7 +23,7 @@ LARGE = 0.9  # quantile of the volumes of Gaussians that counts as 1
 
 
 class Tape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     inner: Any
     decoded: Decoded
@@ -40,7 +40,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Ta
 
 
 def _of_anchors(output: RenderOutput, k: int) -> RenderOutput:
-    """Return the output with rows of anchors in place of those of their K Gaussians: sums, or the largest."""
+    """Return the output with rows of anchors instead of those of their K Gaussians: sums, or the largest."""
     if output.stats is not None:
         s = output.stats
         stats = BlendStats(
@@ -94,7 +94,7 @@ def significance(latents: Floats, v_latents: Floats, contributions: Floats) -> F
 
 
 def contributions_of(gaussians: Gaussians, hit_count: Any, k: int) -> Floats:
-    """Return what the K Gaussians of each anchor contribute to a view, [N].
+    """Return the contribution of the K Gaussians of each anchor to a view, [N].
 
     ``sum_n h_n o_n min(V_n / V_90, 1)`` with the pixels h that a Gaussian hits, its opacity o, and its volume V in
     units of the 90 % quantile of all.

@@ -1,7 +1,7 @@
-"""What CUS-GS trains: anchors at the centres of voxels, the networks that all share, and the memory of features.
+"""The population of CUS-GS: anchors at the centres of voxels, the networks that all share, and the memory of features.
 
-An anchor has a latent z and K offsets. Its other fields are those of one Gaussian of 3DGS, which viewers show in its
-place: the colour of its points, an opacity and a rotation that are not trained, and the scale that its Gaussians begin
+An anchor has a latent z and K offsets. Its other fields are those of one Gaussian of 3DGS, which viewers show instead
+of it: the colour of its points, an opacity and a rotation that are not trained, and the scale that its Gaussians begin
 with.
 """
 
@@ -29,7 +29,7 @@ LATENT_SPREAD = 0.1  # standard deviation of first latents: equal ones would sta
 
 
 class Anchors(NamedTuple):
-    """Voxels with what is decoded to Gaussians; the first six fields are those of :class:`Gaussians`."""
+    """Voxels with the latents that are decoded to Gaussians; the first six fields are those of :class:`Gaussians`."""
 
     means: Floats
     """[N, 3] centres of the voxels, world frame; not trained."""
@@ -149,13 +149,13 @@ def initial_shared(
     hidden : int
         Units of each network's hidden layer.
     embedding : int
-        E, numbers that the networks know of a photograph.
+        E, numbers of the embedding of a photograph.
     query : int
         d, numbers of a query.
     features : str
         Folder of feature maps; empty for the classical ones (:mod:`.maps`).
     similarity : float
-        gamma: cosine from which on a feature counts as one that is remembered (:mod:`.bank`).
+        gamma: cosine from which on a feature counts as present in the memory (:mod:`.bank`).
 
     Raises
     ------

@@ -1,12 +1,12 @@
-"""What the gradient check looks at: with small networks the renderer, blended queries and their loss; reading a memory.
+"""Stages for the gradient check: the renderer with small networks, blended queries and their loss, reads of a memory.
 
-Everything that the recipe holds still is differentiated, too. A ReLU has a kink at 0, whose sides are part of a point.
+Everything that the recipe keeps fixed is differentiated, too. A ReLU has a kink at 0, whose sides are part of a point.
 
-Steps of differences have to be large beside rounding, and small beside the distance to the next threshold. So there are
-few anchors, with Gaussians so large that few of their rims, where alpha falls below its least value, are in the image;
-most ReLUs are on; and features are large, and near those that are wanted, so that the loss is no larger than its
-gradients. The oracle's own check of the loss, which this one replaces, has photographs of noise, whose features are
-all alike, and the recipe's networks: gradients there are a thousandth of the loss, so that the last digit of the loss
+Steps of differences have to be large relative to rounding, and small relative to the distance to the next threshold. So
+there are few anchors, with Gaussians so large that few of their rims, where alpha falls below its minimum, are in the
+image; most ReLUs are on; and features are large, and near those that are wanted, so that the loss is no larger than its
+gradients. The oracle's own check of the loss, which this one replaces, has photographs of noise, whose features are all
+similar, and the recipe's networks: gradients there are a thousandth of the loss, so that the last digit of the loss
 uses up the tolerance.
 """
 
@@ -44,17 +44,17 @@ N_REMEMBERED, N_CHANNELS = 3, 5
 SPREAD = 0.5  # of random weights
 VOXEL, N_ANCHORS = 8.0, 8  # side in units of the median scale, and the most that are taken
 WIDER = 3.0  # than anchors begin with
-ON = 0.5  # is added to what ReLUs read
+ON = 0.5  # is added to the inputs of ReLUs
 LONG, SHORT = 10.0, 0.02  # memory and keys of the loss: large features, and attention to more than one row
 NEAR = 1.0  # standard deviation of features from those that are wanted
-MODELS = 3  # seed of the models: with it no gradient is small beside the values of which differences are taken
+MODELS = 3  # seed of the models: with it no gradient is small relative to the values of which differences are taken
 N_PIXELS = 12  # that the loss compares, at most
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return all; the first replaces that of the renderer as a whole, the last the oracle's of the loss of features.
 
-    The models have a seed of their own, so that no check before this one changes at which point it is made.
+    The models have a separate seed, so that earlier checks do not change the point of this one.
     """
     own = np.random.default_rng(MODELS)
     return (
@@ -122,7 +122,7 @@ def _sides(model: Model, view: View, *, with_queries: bool = False) -> tuple[Any
 
 
 class _Movable(NamedTuple):
-    """A small model, and what of it is differentiated."""
+    """A small model, and the parts of it that are differentiated."""
 
     model: Model
     view: View
@@ -196,7 +196,7 @@ def _loss_stage(backend: Backend, setting: Setting, rng: np.random.Generator) ->
 
 
 def _reading_stage(rng: np.random.Generator) -> Stage:
-    """Return the error of features that queries read, as a function of the queries, the memory and what is learned."""
+    """Return the error of features that queries read, as a function of the queries, the memory and the parameters."""
     inputs = {"queries": rng.normal(size=(4, QUERY)), **memory_of(rng)}
     target = rng.normal(size=(4, N_CHANNELS))
 

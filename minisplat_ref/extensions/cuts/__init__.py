@@ -1,8 +1,8 @@
 """Cuts: a Bezier curve in each Gaussian's plane cuts a part of it away, so edges are sharp.
 
-This follows DisC-GS, Qu et al. 2024, arXiv 2405.15196. A Gaussian is smooth, and spills over the edges of what it
-shows. Here each has cubic curves in the plane of its first two axes (:mod:`minisplat_ref.extensions.cuts.response`),
-one unless ``n_curves`` says otherwise, and what lies behind one, seen from the centre, is cut away
+This follows DisC-GS, Qu et al. 2024, arXiv 2405.15196. A Gaussian is smooth, and spills over the edges of objects. Here
+each has cubic curves in the plane of its first two axes (:mod:`minisplat_ref.extensions.cuts.response`), as many as
+``n_curves``, by default one, and the part behind a curve, seen from the centre, is cut away
 (:mod:`minisplat_ref.extensions.cuts.curve`):
 
     alpha = o exp(-d^T Q d / 2) mask(d),   mask = 1 where the segment from the centre to d crosses the curves an
@@ -10,7 +10,7 @@ one unless ``n_curves`` says otherwise, and what lies behind one, seen from the 
 
 A step has no derivative. So training uses ``1 / (1 + exp(-distance / w))`` of the signed distance to the edge of the
 part that is cut away, with its exact gradient; w is 1 pixel at first, then half a pixel, and 0 in the last iteration,
-so what is saved, evaluated and rendered has hard edges. ``widths`` is a column of the PLY.
+so the saved and evaluated model has hard edges. ``widths`` is a column of the PLY.
 
     minisplat-ref train SCENE --recipe cuts
     minisplat-ref train SCENE --recipe cuts --set n_curves=2
@@ -23,7 +23,7 @@ so what is saved, evaluated and rendered has hard edges. ``widths`` is a column 
 This deviates from the paper, which keeps the step and replaces its gradient by an approximation. Control points are in
 standard deviations instead of world units, and follow the affine map that projects the Gaussian, so that its cuts
 rotate and shrink with it. A curve is a polygon of 8 edges, so that crossings are counted without roots of cubics. Where
-a curve moves across the centre, what was cut away and what was left change places, and the image jumps, which no
+a curve moves across the centre, the part that was cut away and the rest change places, and the image jumps, which no
 gradient shows. Training does not change which axes are the first two; if a Gaussian becomes flat along one of them, its
 curves are seen edge on.
 """

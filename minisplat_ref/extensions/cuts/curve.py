@@ -1,10 +1,10 @@
 """Bezier curves as polygons: the side on which a pixel lies, and its distance, in NumPy (DisC-GS, 2405.15196).
 
-The cubic B(t) of four control points P_j, in pixels from the Gaussian's centre, is drawn as ``N_EDGES`` edges between
-``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of edges
-of all M curves. So one curve cuts its shadow away, with a lamp at the centre, and where the shadows of two overlap, the
-pixel is visible again. A shadow is bounded by the curve and by two rays, on which its ends B(0) and B(1) move away from
-the centre. With the nearest point q of these M (N_EDGES + 2) pieces::
+The cubic B(t) of four control points P_j, in pixels from the Gaussian's centre, is approximated by ``N_EDGES`` edges
+between ``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of
+edges of all M curves. So one curve cuts its shadow away, with a lamp at the centre, and where the shadows of two
+overlap, the pixel is visible again. A shadow is bounded by the curve and by two rays, on which its ends B(0) and B(1)
+move away from the centre. With the nearest point q of these M (N_EDGES + 2) pieces::
 
     o_i = sum_j a_ij P_j,  u_i = sum_j b_ij P_j       a piece runs from o_i along u_i: an edge once, a ray for ever
     f_i = clip((d - o_i) . u_i / u_i . u_i, 0, top_i),  q = o_i + f_i u_i of the piece where |d - q| is least
@@ -39,7 +39,7 @@ N_PIECES = len(TOPS)  # of a curve
 
 
 def of_curves(weights: Floats, n: int) -> Floats:
-    """Return weights [K, 4] of one curve's points as those [n K, 4 n] of n curves, each of its own four."""
+    """Return weights [K, 4] of one curve's points as those [n K, 4 n] of n curves with four points each."""
     return np.kron(np.eye(n), weights)
 
 
@@ -92,7 +92,7 @@ def _masks(distances: Floats, widths: Floats) -> Floats:
 
 
 def n_crossings(points: Floats, offsets: Floats) -> Ints:
-    """Return how many edges [G, P] of all curves the segments from the centre to pixels cross.
+    """Return the number [G, P] of edges of all curves that the segments from the centre to pixels cross.
 
     An edge is crossed if its ends lie on different sides of the line through centre and pixel, and centre and pixel on
     different sides of the edge. Zero counts as negative, so a line through a vertex crosses one of its two edges, or

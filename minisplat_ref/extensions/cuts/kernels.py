@@ -84,7 +84,7 @@ def make_cut_response(exp: Callable, n_curves: int) -> KernelResponse:
 
     @scalar
     def along(records, n, dx, dy, k, end):
-        """Return how far beyond an end of curve k a pixel lies along its ray, in units of the end's distance."""
+        """Return the distance of a pixel beyond an end of curve k along its ray, in units of the end's distance."""
         at = vertices_at + N_VERTICES * k + 2 * N_EDGES * end
         beyond = (dx - records[n, at]) * records[n, at] + (dy - records[n, at + 1]) * records[n, at + 1]
         return beyond * records[n, inverses_at + N_INVERSES * k + N_EDGES + end]

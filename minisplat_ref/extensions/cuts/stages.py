@@ -13,7 +13,7 @@ from minisplat_ref.types import Floats, Gaussians
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer of two curves as a stage; the reference finds which hits count, and what is nearest."""
+    """Return the renderer of two curves as a stage; the reference finds the hits that count, and the nearest pieces."""
     return (renderer_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
 
 

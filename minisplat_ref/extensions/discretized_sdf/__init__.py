@@ -1,8 +1,8 @@
 """Discretised SDF: opacity from a signed distance that each surfel stores.
 
 This follows Discretized SDF Gaussian Splatting (2025), arXiv 2507.15629, on the surfels, materials and shading of
-Ref-Gaussian (:mod:`minisplat_ref.mechanisms.gbuffer`). A surfel with the centre mu and the normal n stores s, how far
-mu is from the surface. With one gamma > 0 for all, which is trained, too, its opacity is
+Ref-Gaussian (:mod:`minisplat_ref.mechanisms.gbuffer`). A surfel with the centre mu and the normal n stores s, the
+signed distance of mu from the surface. With one gamma > 0 for all, which is trained, too, its opacity is
 
     o = 4 exp(-gamma s) / (1 + exp(-gamma s))^2 = sech^2(gamma s / 2),   do/ds = -gamma tanh(gamma s / 2) o
 
@@ -23,9 +23,9 @@ Training begins with the foreground on a sphere; its stages of shading are those
 
 ``docs/FAMILY.md`` has the measured figures.
 
-The PLY has the distances, and as ``opacity`` what follows from them, for other viewers; gamma is in ``shared.npz``
-beside it, as ln(1 / gamma), the environment likewise. Clones and children of a split inherit s, which a tangent plane
-does not change; faint surfels are pruned by their opacity, and a reset of opacities raises |s|.
+The PLY has the distances, and as ``opacity`` the opacities that follow from them, for other viewers; gamma is in
+``shared.npz`` beside it, as ln(1 / gamma), the environment likewise. Clones and children of a split inherit s, which a
+tangent plane does not change; faint surfels are pruned by their opacity, and a reset of opacities raises |s|.
 
 This deviates from the paper as follows. The foreground is the half of the points that is nearest to their median, and
 its radius, the weight of the projection, the first gamma and all rates are ours. The inverse of D is interpolated.

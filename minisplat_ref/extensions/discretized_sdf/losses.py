@@ -21,7 +21,7 @@ from minisplat_ref.reference.pinhole import pinhole, pose, with_principal_point
 from minisplat_ref.training.losses import Cotangents, Rendered
 from minisplat_ref.types import Floats
 
-Z_MIN = 0.01  # world units: what is nearer to the camera's plane has no pixel
+Z_MIN = 0.01  # world units: points nearer to the camera's plane have no pixel
 ALPHA_MARGIN = 1e-6  # of A from 0 and 1, where the cross entropy is infinite
 
 

@@ -31,7 +31,7 @@ from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 
 class SDFTape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     shaded: shaded.ReflectiveTape
     distances: Floats  # [N]
@@ -57,7 +57,7 @@ def render(
 
 
 def render_vjp(tape: SDFTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`: what the logits get goes to distances and gamma."""
+    """Gradient of :func:`render`: that of the logits passes to distances and gamma."""
     v = shaded.render_vjp(tape.shaded, v_image, v_alpha)
     v_logits = v.gaussians.opacity_logits
     v_distances, v_log_width = opacity_logits_vjp(tape.distances, tape.log_width, v_logits)

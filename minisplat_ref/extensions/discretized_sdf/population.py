@@ -1,4 +1,4 @@
-"""Surfels with a signed distance, how they start, and what they share: gamma, beside the light."""
+"""Surfels with a signed distance, their start, and their shared parameters: gamma, beside the light."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -22,14 +22,14 @@ class SDFSurfels(NamedTuple):
     quats: Floats
     log_scales: Floats
     opacity_logits: Floats
-    """[N] no parameter: what follows from the distances, for density control and for files."""
+    """[N] no parameter: computed from the distances, for density control and for files."""
     sh_dc: Floats
     sh_rest: Floats
     albedo_logits: Floats
     metallic_logits: Floats
     roughness_logits: Floats
     distances: Floats
-    """[N] s: how far the centre is from the surface, positive on the side of the normal; world units."""
+    """[N] s: distance of the centre from the surface, positive on the side of the normal; world units."""
 
 
 def with_distances(gaussians: Gaussians, rng: np.random.Generator, *, foreground: float) -> SDFSurfels:

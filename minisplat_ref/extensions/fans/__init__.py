@@ -22,9 +22,9 @@ gradients, so that the position, colour and opacity of each vertex can be traine
 ``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper as follows. Colours and opacities are clipped to [0, 1] after every step, so that a file
-holds what is rendered. Fans are pruned whole, by their most opaque vertex; single triangles are left out when a mesh is
-exported. A flat fan lies in the plane of the two larger axes, even of a Gaussian that is not flat, and vanishes when it
-is seen edge on; three fans do not, but overlap.
+holds the values that are rendered. Fans are pruned whole, by their most opaque vertex; single triangles are left out
+when a mesh is exported. A flat fan lies in the plane of the two larger axes, even of a Gaussian that is not flat, and
+vanishes when it is seen edge on; three fans do not, but overlap.
 
 Left out are textures, view-dependent colour, growing new fans, and pruning by gradients; .obj files have no opacities.
 """

@@ -1,4 +1,4 @@
-"""What the commands of fans share: the options that say how Gaussians become fans, and the model that they work on."""
+"""Arguments that the commands of fans share: the options for making fans of Gaussians, and the model."""
 
 import argparse
 from pathlib import Path
@@ -38,7 +38,7 @@ def add_shape(parser: Any) -> None:
 
 
 def shape_of(args: argparse.Namespace) -> FanShape:
-    """Return the shape that the options say.
+    """Return the shape of the options.
 
     Raises
     ------

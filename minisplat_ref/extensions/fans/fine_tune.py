@@ -36,7 +36,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, write, and say what it has brought on the test views.
+    """Train, write, and report the change on the test views.
 
     Raises
     ------

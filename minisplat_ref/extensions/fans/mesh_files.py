@@ -8,7 +8,7 @@ A mesh file has a colour at each vertex, red, green, blue and opacity.
 - ``.obj``: the world frame. The format has no opacity at a vertex, so that all triangles are opaque.
 
 The population's PLY holds every fan whole, with floats ``rgba_0`` to ``rgba_3`` besides the bytes, so that it can be
-trained further and drawn exactly. Its faces say how many sides a fan has, and whether it is flat.
+trained further and rendered exactly. Its faces encode how many sides a fan has, and whether it is flat.
 """
 
 from pathlib import Path
@@ -33,7 +33,7 @@ LABEL = Label("fans")
 
 
 def write_mesh(path: Path, mesh: TranslucentMesh) -> None:
-    """Write a mesh in the format that its suffix says, complete or not at all.
+    """Write a mesh in the format of its suffix, complete or not at all.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def write_mesh(path: Path, mesh: TranslucentMesh) -> None:
 
 
 def save_fans(path: str | Path, fans: Fans, label: Label = LABEL) -> None:
-    """Write a population of fans as a PLY in float32, complete or not at all; its label says what draws it.
+    """Write a population of fans as a PLY in float32, complete or not at all; its label names its renderer.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def is_fans(path: str | Path) -> bool:
 
 
 def load_fans(path: str | Path, population: Any = Fans) -> Fans:
-    """Read what :func:`save_fans` wrote, in float32.
+    """Read a file of :func:`save_fans`, in float32.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""How fans are drawn, and the recipe that trains their vertices.
+"""The renderer of fans, and the recipe that trains their vertices.
 
-A training moves every vertex and changes its colour and opacity, by the loss of 3DGS. Colours and opacities are what
-mesh files hold, numbers in [0, 1] without an activation: after each step they are put back into that range.
+A training moves every vertex and changes its colour and opacity, by the loss of 3DGS. Colours and opacities are those
+of mesh files, numbers in [0, 1] without an activation: after each step they are put back into that range.
 """
 
 from functools import partial
@@ -38,7 +38,7 @@ def as_fans(
 
 
 class _Tape(NamedTuple):
-    """What the gradient needs again."""
+    """The values that the gradient needs again."""
 
     fans: Fans
     mesh: TranslucentMesh

@@ -28,7 +28,7 @@ FRONT_REACH = 2.5  # k of the fan of 8 sides that is nearest to a Gaussian seen 
 
 
 class FanShape(NamedTuple):
-    """How Gaussians become fans.
+    """Options of turning Gaussians into fans.
 
     The default reach is larger than ``FRONT_REACH``: a scene of many shows holes more than it shows fans that overlap.
     """
@@ -82,7 +82,7 @@ def check_shape(shape: FanShape) -> None:
 def convert_gaussians(gaussians: Gaussians, shape: FanShape) -> Fans:
     """Return the fans of Gaussians, in their dtype.
 
-    Colours are those of degree 0, ``0.5 + C_0 c_0``, clipped to [0, 1], which is what mesh files hold.
+    Colours are those of degree 0, ``0.5 + C_0 c_0``, clipped to [0, 1], as in mesh files.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the gradient proof checks: the renderer, with the layers of every pixel as its thresholds."""
+"""Stages for the gradient proof: the renderer, with the layers of every pixel as its thresholds."""
 
 import numpy as np
 

@@ -67,7 +67,7 @@ def best_shape(
 
 
 def representation_of(population: Any) -> Any:
-    """Return what a population of fans, or of Gaussians, is drawn by."""
+    """Return the renderer of a population of fans, or of Gaussians."""
     return FANS_OF_GAUSSIANS if isinstance(population, Fans) else GAUSSIANS
 
 

@@ -1,9 +1,9 @@
 """GaMeS: Gaussians that are trained on the faces of a mesh.
 
 This follows GaMeS: Mesh-Based Adapting and Modification of Gaussian Splatting (2024), arXiv 2402.01459, for a scene
-whose mesh is given. Each face carries a fixed number of Gaussians. A Gaussian stores how it weighs the three corners
-and how large it is beside the face, so its mean lies on the face, its normal is that of the face, and its other two
-axes are those of the face (:mod:`.faces` has the equations). Whatever moves the corners moves the Gaussians.
+whose mesh is given. Each face carries a fixed number of Gaussians. A Gaussian stores its weights of the three corners
+and its size relative to the face, so its mean lies on the face, its normal is that of the face, and its other two axes
+are those of the face (:mod:`.faces` has the equations). Whatever moves the corners moves the Gaussians.
 
     minisplat-ref mesh runs/fox --out fox.ply
     minisplat-ref train data/fox --recipe games --init fox.ply --set per_face=5 --out runs/on_mesh

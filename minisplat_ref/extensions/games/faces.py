@@ -25,7 +25,7 @@ class FaceGaussians(NamedTuple):
     """Gaussians with the face that each is on: the six fields of ``Gaussians``, and five more."""
 
     means: Floats
-    """[N, 3] no parameter: what follows from the further fields, for culling and for files; so are the next two."""
+    """[N, 3] no parameter: computed from the further fields, for culling and for files; so are the next two."""
     quats: Floats
     log_scales: Floats
     opacity_logits: Floats
@@ -42,7 +42,7 @@ class FaceGaussians(NamedTuple):
 
 
 class FaceFrames(NamedTuple):
-    """What follows from the corners alone."""
+    """The quantities that follow from the corners alone."""
 
     quats: Floats
     """[N, 4] of R."""
@@ -84,7 +84,7 @@ def place_vjp(g: FaceGaussians, v: FaceGaussians) -> FaceGaussians:
     g : FaceGaussians
         As for :func:`place`.
     v : FaceGaussians
-        Derivatives with respect to what it returns; those of the five further fields are zero.
+        Derivatives with respect to its result; those of the five further fields are zero.
 
     Returns
     -------
@@ -109,7 +109,7 @@ def corner_weights(corner_logits: Floats) -> Floats:
 
 
 def on_own_faces(gaussians: Gaussians, rng: np.random.Generator) -> FaceGaussians:
-    """Return each Gaussian in the middle of a face of its own, which gives it its rotation, and its scales for rho = 1.
+    """Return one Gaussian in the middle of each face, with the face's rotation, and its scales for rho = 1.
 
     :func:`place` then returns its mean, its rotation, and its second and third scale; along its first axis it is flat.
     With the mean m, and s2 and s3 along r2 and r3, the corners are

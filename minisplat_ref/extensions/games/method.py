@@ -1,4 +1,4 @@
-"""The renderer and the recipe of Gaussians on the faces of a mesh, and how a training begins on one."""
+"""The renderer and the recipe of Gaussians on the faces of a mesh, and the start of a training on one."""
 
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
 
 class FaceTape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     splatting: Any
     gaussians: FaceGaussians
@@ -37,7 +37,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Fa
 
 
 def render_vjp(tape: FaceTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`: what means and scales get goes to weights of corners and to sizes."""
+    """Gradient of :func:`render`: that of means and scales passes to weights of corners and to sizes."""
     v = SPLATTING.render_vjp(tape.splatting, v_image, v_alpha)
     return v._replace(gaussians=place_vjp(tape.gaussians, v.gaussians))
 

@@ -1,6 +1,6 @@
-"""The stage ``background``: what lies behind the scene, a function of the direction alone.
+"""The stage ``background``: the light from behind the scene, a function of the direction alone.
 
-Each alternative has one shared parameter of the model, ``sky``, whose shape is its own.
+Each alternative has one shared parameter of the model, ``sky``, with an individual shape.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,7 +38,7 @@ class Background(NamedTuple):
     initial: Callable[[], Mapping[str, Floats]]
     """Returns the shared parameter ``sky``, or nothing."""
     wrap: Callable[[Renderer], Renderer]
-    """Wraps a renderer in one that draws it behind everything."""
+    """Wraps a renderer in one that renders it behind everything."""
 
 
 class Light(NamedTuple):
@@ -51,7 +51,7 @@ class Light(NamedTuple):
 
 
 class LightGradient(NamedTuple):
-    """Gradient with respect to what the light depends on."""
+    """Gradient with respect to the parameters of the light."""
 
     sky: Floats
     cam_from_world_R: Floats

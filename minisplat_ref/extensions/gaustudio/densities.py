@@ -1,4 +1,4 @@
-"""The stage ``density``: what becomes of the Gaussians whose images move, at the dates of 3DGS."""
+"""The stage ``density``: the treatment of Gaussians whose images move, at the dates of 3DGS."""
 
 import numpy as np
 

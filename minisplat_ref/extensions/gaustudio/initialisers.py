@@ -12,7 +12,7 @@ from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.types import Gaussians, Scene
 
 BOX_SHARE = 0.02  # of the points that may lie outside of the box on either side of an axis
-LARGEST = 0.05  # of the scene's extent, a standard deviation in the box: what exceeds 0.1, density control removes
+LARGEST = 0.05  # of the scene's extent, a standard deviation in the box: density control removes those above 0.1
 
 
 def points(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussians | None:

@@ -1,4 +1,4 @@
-"""The stage ``photo_loss``, how an image is compared with its photograph, and the loss on the sky."""
+"""The stage ``photo_loss``, the comparison of an image with its photograph, and the loss on the sky."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref gaustudio masks``: masks of the sky as files, to look at and to mend."""
+"""The command ``minisplat-ref gaustudio masks``: masks of the sky as files, for inspection and correction."""
 
 import argparse
 from pathlib import Path
@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a mask for each photograph, and say how much of it is sky."""
+    """Write a mask for each photograph, and report its fraction of sky."""
     scene = load_scene(args.scene, test_every=0)
     shares = []
     with making_folder(args.out) as folder:

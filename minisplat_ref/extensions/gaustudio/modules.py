@@ -24,7 +24,7 @@ DEPTHS = {
     "expected": "the mean of all hits.",
     "midpoint": "of the dominant Gaussian; surfels have none.",
 }
-"""What ``mesh --depth`` takes, its default first."""
+"""The values of ``mesh --depth``, the default first."""
 EPILOG = """\
 examples:
   minisplat-ref train SCENE --recipe gaustudio --set background=sky_map
@@ -33,7 +33,7 @@ examples:
 
 
 class Stage(NamedTuple):
-    """A stage of the recipe, and what it can be."""
+    """A stage of the recipe, and its alternatives."""
 
     name: str
     """In ``--set NAME=MODULE``."""

@@ -1,6 +1,6 @@
 """The formulas of the background and of the loss on the sky: a ball of Gaussians, a map of directions, light behind.
 
-There is no kernel: the ball is drawn by the renderer of 3DGS, and the rest is done once for each pixel.
+There is no kernel: the ball is rendered by the renderer of 3DGS, and the rest is done once for each pixel.
 """
 
 from typing import NamedTuple
@@ -65,7 +65,7 @@ def ball_gaussians_vjp(v: Gaussians) -> Floats:
 
 
 class Lookup(NamedTuple):
-    """Where a map is read: four texels and two weights for each direction."""
+    """The places at which a map is read: four texels and two weights for each direction."""
 
     rows: tuple[Ints, Ints]
     """[P] the upper and the lower row."""

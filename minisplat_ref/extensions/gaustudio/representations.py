@@ -1,4 +1,4 @@
-"""The stage ``representation``: what the primitives are. All have the six fields of 3DGS."""
+"""The stage ``representation``: the kind of primitives. All have the six fields of 3DGS."""
 
 from collections.abc import Callable
 from typing import NamedTuple

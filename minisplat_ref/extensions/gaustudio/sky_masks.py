@@ -1,6 +1,6 @@
-"""The stage ``sky_mask``: which pixels of a photograph show the sky.
+"""The stage ``sky_mask``: the pixels of a photograph that show the sky.
 
-GauStudio takes masks from a network. Here they are an input, or what the colours say: from the upper edge of the
+GauStudio takes masks from a network. Here they are an input, or derived from the colours: from the upper edge of the
 photograph down, pixels that are bright and more blue than red, or white. That takes for sky whatever looks like it.
 """
 

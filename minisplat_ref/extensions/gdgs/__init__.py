@@ -9,8 +9,8 @@ the normal (:mod:`minisplat_ref.extensions.gdgs.reference`):
 
 From 10,000 on, a grid of regions controls density: Gaussians of large gradients are cloned where a region is uneven,
 and a term acts on the densest regions. The printed term is the sum of the pairs' squared distances; minimised, it pulls
-them together, although it is to disperse them. Here ``contraction`` is that term, of weight 0, and ``dispersion`` a
-repulsive one, ``sum exp(-|x_i - x_j|^2 / 2 h^2)``, which does what the text says.
+them together, although it should disperse them. Here ``contraction`` is that term, of weight 0, and ``dispersion`` a
+repulsive one, ``sum exp(-|x_i - x_j|^2 / 2 h^2)``, which disperses them as intended.
 
     minisplat-ref train SCENE --recipe gdgs
     minisplat-ref train SCENE --recipe gdgs --set dispersion=0 --set contraction=0.001

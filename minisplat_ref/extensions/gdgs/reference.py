@@ -36,7 +36,7 @@ class Attraction(NamedTuple):
 
 
 def attract(population: Any, planes: LocalPlanes, weights: Weights, offset: float, unit: float) -> Attraction:
-    """Return how far primitives are from the planes of their nearest points, and turned away from them.
+    """Return the loss of primitives' distances from the planes of their nearest points, and of their tilt.
 
     With the nearest point's plane (m, N), the shortest axis U and the target ``mu*`` at the distance d from the plane::
 
@@ -144,7 +144,7 @@ def disperse(means: Floats, members: list[Ints], h: float) -> tuple[float, Float
         v_x_i = -(1 / n) sum_j (x_i - x_j) / h^2 exp(...)
 
     over the pairs within ``REACH`` h of each other, beyond which E would be negative. In a region of more than
-    ``PAIRED_MAX`` every k-th stands for the others: pairs grow with the square, and where a few points lie far away,
+    ``PAIRED_MAX`` every k-th represents the others: pairs grow with the square, and where a few points lie far away,
     one region holds almost everything.
     """
     v, value, floor = np.zeros(means.shape), 0.0, np.exp(-(REACH**2) / 2)

@@ -21,7 +21,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 class GeometricTape(NamedTuple):
-    """What the forward pass keeps for the gradient of the geometric loss."""
+    """The values that the forward pass keeps for the gradient of the geometric loss."""
 
     accumulated_depth: Floats
     alpha: Floats

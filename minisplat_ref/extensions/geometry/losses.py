@@ -37,7 +37,7 @@ def sfm_depth(rendered: Rendered) -> tuple[float, Cotangents]:
     Raises
     ------
     InputError
-        The scene does not say which view sees which point.
+        The scene does not record which view sees which point.
     """
     if rendered.view.point_ids is None:
         raise InputError(

@@ -1,6 +1,6 @@
 """Stage 7, optional: losses that compare a rendered depth map with what is known or likely about surfaces.
 
-There are three terms beside the photometric loss. None is part of 3DGS or Mini-Splatting; all have the weight 0 by
+There are three terms besides the photometric loss. None is part of 3DGS or Mini-Splatting; all have the weight 0 by
 default:
 
 * depth at the points of structure from motion, as in DS-NeRF (Deng et al. 2022), here robust (Huber 1964);
@@ -27,7 +27,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 class GeometricTape(NamedTuple):
-    """What the forward pass keeps for the gradient of the geometric loss."""
+    """The values that the forward pass keeps for the gradient of the geometric loss."""
 
     accumulated_depth: Floats
     """[H, W]."""
@@ -318,6 +318,6 @@ def _mean_weights(weights: tuple[Floats, Floats], exists: Bools) -> tuple[Floats
 
 
 def _diff_vjp(v_difference: Floats, axis: int) -> Floats:
-    """Gradient of ``np.diff``: ``v_x_j = v_difference_(j-1) - v_difference_j``."""
+    """Gradient of ``np.diff``: ``v_x_j = v_difference_{j-1} - v_difference_j``."""
     padding = [(1, 1) if a == axis else (0, 0) for a in range(v_difference.ndim)]
     return -np.diff(np.pad(v_difference, padding), axis=axis)

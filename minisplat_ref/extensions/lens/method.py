@@ -1,4 +1,4 @@
-"""The representation that is drawn through lenses, and its recipe."""
+"""The representation that is rendered through lenses, and its recipe."""
 
 from minisplat_ref.extensions.lens.renderer import render, render_vjp
 from minisplat_ref.mechanisms.cameras.models import are_inside

@@ -43,7 +43,7 @@ class Prepared(NamedTuple):
     primitives: Primitives
     camera: Camera
     footprints: LensFootprints
-    channels: Floats  # [N, D] colours, then the depth if asked for
+    channels: Floats  # [N, D] colours, then the depth on request
     background: Floats  # [D]
     has_depth: bool
     conventions: Conventions
@@ -55,7 +55,7 @@ class Prepared(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     prepared: Prepared
     bins: TileBins

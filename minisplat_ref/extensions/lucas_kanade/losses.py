@@ -1,7 +1,7 @@
 """The two losses: flow against that of the photographs, and the order of depths.
 
-The flow of a view needs the camera and the time of the next photograph, which no renderer knows; so the term blends it
-itself, with the compositor of the backend, and returns derivatives with respect to the Gaussians and the warp.
+The flow of a view needs the camera and the time of the next photograph, which renderers do not have; so the term blends
+it itself, with the compositor of the backend, and returns derivatives with respect to the Gaussians and the warp.
 """
 
 from functools import lru_cache
@@ -34,7 +34,7 @@ from minisplat_ref.training.losses import Cotangents, Rendered
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Scene, SHGradient, View
 
 SHAPE = ("means", "quats", "log_scales", "opacity_logits")  # of a Gaussian: a flow does not depend on its colours
-NEAR = 0.01  # world units: what is nearer to the second camera has no place in its image
+NEAR = 0.01  # world units: points nearer to the second camera have no place in its image
 LONE_STEP = 1.0  # unit of time after which a scene of one photograph is taken to look the same
 ALPHA_MIN = 0.5  # of a pixel that has a depth
 N_SAMPLES = 1_024  # pixels of a depth map that are compared, in pairs
@@ -45,7 +45,7 @@ GAP = 0.02  # of the range of the given depths: pairs that differ by less have n
 
 
 class FlowTape(NamedTuple):
-    """What :func:`rendered_flow` keeps for its gradient."""
+    """The values that :func:`rendered_flow` keeps for its gradient."""
 
     moved: Moved
     splats: SplatTape
@@ -103,7 +103,7 @@ def flow(rendered: Rendered, *, flows: str) -> tuple[float, Cotangents]:
 def rendered_flow(model: Model, view: View, other: View, request: Request) -> tuple[Floats, Floats, FlowTape]:
     """Return the flow ``F = sum_i w_i f_i`` from a view to another, and the accumulated opacity.
 
-    ``f_i`` is how far a Gaussian moves in the image, from its place in the view to where one step of Runge-Kutta leads
+    ``f_i`` is the motion of a Gaussian in the image, from its place in the view to where one step of Runge-Kutta leads
     it in the other (:func:`~minisplat_ref.mechanisms.motion.velocity.power_steps`); 0 where the other camera does not
     see it in front of itself.
 
@@ -134,7 +134,7 @@ def rendered_flow(model: Model, view: View, other: View, request: Request) -> tu
 def blended_steps(
     g: Gaussians, after: Floats, cameras: tuple[Camera, Camera], request: Request
 ) -> tuple[SplatTape, Step, Ints]:
-    """Blend how far Gaussians move in the image.
+    """Blend the motion of Gaussians in the image.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ Image = NDArray[np.uint8]
 
 
 class _Photographs:
-    """Two images, equal to two others of the same pixels: what a cache asks for."""
+    """Two images, equal to two others of the same pixels, as the key of a cache."""
 
     def __init__(self, first: Image, second: Image) -> None:
         self.images = (first, second)
@@ -264,7 +264,7 @@ def _read_map(path: Path, shape: tuple[int, ...], name: str) -> Floats:
 
 
 def depth_order(rendered: Rendered, *, depths: str, margin: float) -> tuple[float, Cotangents]:
-    """Return how many pairs of pixels are in the wrong order of depth, and by how much; with its derivatives.
+    """Return the loss of pairs of pixels in the wrong order of depth, and its derivatives.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def depth_order(rendered: Rendered, *, depths: str, margin: float) -> tuple[floa
     Raises
     ------
     InputError
-        A file is missing or has another size, or neither files nor points say anything.
+        A file is missing or has another size, or there are neither files nor points.
     """
     view, sums, alpha = rendered.view, rendered.channel("depth")[..., 0], rendered.output.alpha
     rng = np.random.default_rng(rendered.step)

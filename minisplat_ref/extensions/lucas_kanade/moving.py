@@ -1,4 +1,4 @@
-"""Gaussians at a time: what the warp makes of those of time 0, and its gradient."""
+"""Gaussians at a time: those of time 0 after the warp, and the gradient."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ SHIFTS, TURNS, GROWTHS = "warp_shifts", "warp_turns", "warp_growths"  # [B, P, 3
 
 
 class Moved(NamedTuple):
-    """Gaussians at a time, and what the gradient needs."""
+    """Gaussians at a time, and the values that the gradient needs."""
 
     gaussians: Gaussians
     """At that time."""

@@ -5,7 +5,7 @@ the gradient g of the images, their difference e and the sums over window and co
 
     (sum g g^T + eps I) d = -sum g e
 
-A step is right only while the motion is smaller than what blurs the image, so the flow of a coarse level is the start
+A step is right only while the motion is smaller than the blur of the image, so the flow of a coarse level is the start
 of the next finer one (Bouguet 2000), where its median over 3 x 3 pixels moves the second image. There is no smoothness
 term: where a window has no texture in two directions, or the flow there and back does not return, nothing is known.
 Forward only; a loss takes the flow as it is.
@@ -28,7 +28,7 @@ RETURN_MAX = 0.5  # pixels by which the flow there and back may miss
 
 
 class Flow(NamedTuple):
-    """Where the pixels of one photograph are in another."""
+    """The places of one photograph's pixels in another."""
 
     motion: Floats
     """[H, W, 2] along x and y, pixels."""
@@ -79,7 +79,7 @@ def _step(first: Floats, moved: Floats) -> Floats:
     xx, yy = xx + DAMPING, yy + DAMPING
     determinant = xx * yy - xy * xy
     step = np.stack([xy * ye - yy * xe, xy * xe - xx * ye], axis=2) / determinant[..., None]
-    return np.clip(step, -1.0, 1.0)  # beyond a pixel the linear model says nothing
+    return np.clip(step, -1.0, 1.0)  # beyond a pixel the linear model is invalid
 
 
 def _in_window(a: Floats, b: Floats) -> Floats:

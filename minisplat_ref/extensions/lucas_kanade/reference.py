@@ -1,4 +1,4 @@
-"""The formulas: how a Gaussian turns, how far it moves in the image, and both losses; each beside its gradient."""
+"""The formulas of a Gaussian's rotation, its motion in the image, and both losses; each beside its gradient."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ import numpy as np
 from minisplat_ref.reference.pinhole import pinhole, pinhole_vjp, pose
 from minisplat_ref.types import Bools, Camera, Floats, Ints
 
-SOFT = 0.1  # pixels: what the flow of photographs is right within
+SOFT = 0.1  # pixels: accuracy of the flow of photographs
 
 
 def turned(quats: Floats, turns: Floats) -> Floats:
@@ -55,7 +55,7 @@ class Step(NamedTuple):
 
 
 def image_steps(before: Floats, after: Floats, cameras: tuple[Camera, Camera]) -> tuple[Floats, Step]:
-    """Return how far places move in the image: ``pi'(R' x' + t') - pi(R x + t)``, [N, 2] in pixels.
+    """Return the motion of places in the image: ``pi'(R' x' + t') - pi(R x + t)``, [N, 2] in pixels.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def image_steps_vjp(step: Step, v: Floats) -> tuple[Floats, Floats]:
 
 
 def flow_error(flow: Floats, alpha: Floats, target: Floats, is_known: Bools) -> float:
-    """Return how far a rendered flow is from the given one, in image widths.
+    """Return the distance of a rendered flow from the given one, in image widths.
 
     ::
 
@@ -123,7 +123,7 @@ class Pairs(NamedTuple):
 
 
 def order_error(sums: Floats, alpha: Floats, pairs: Pairs, margin: float) -> float:
-    """Return how far pairs of pixels are from the right order in depth.
+    """Return the violation of the order in depth by pairs of pixels.
 
     ::
 

@@ -1,7 +1,7 @@
 """Micro-splatting: small Gaussians, split at the photographs' edges, merged where alike.
 
-This follows Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that
-explains an edge in one place is wrong beside it. There are three changes to 3DGS
+This follows Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that fits
+an edge in one place is wrong next to it. There are three changes to 3DGS
 (:mod:`minisplat_ref.extensions.micro.method`):
 
 - *Trace penalty.* ``L = L_photometric + lambda mean_k max(tr(Sigma_k) / tau - 1, 0)`` with

@@ -125,7 +125,7 @@ def prune_least(state: TrainState, iteration: Iteration, *, score_mass: float) -
 
 
 def clusters(gaussians: Gaussians, *, reach: float, color_reach: float) -> Ints:
-    """Return labels [N] for merging: mutual nearest neighbours that are alike share one, all others have their own."""
+    """Return labels [N] for merging: mutual nearest neighbours that are similar share one, all others are distinct."""
     labels = np.arange(n_rows(gaussians))
     if len(labels) < 2:
         return labels

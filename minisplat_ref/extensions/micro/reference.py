@@ -100,10 +100,10 @@ def box_means(image: Floats, boxes: Ints) -> Floats:
 
 
 def are_alike(distances: Floats, sizes: Floats, colors: Floats, *, reach: float, color_reach: float) -> Bools:
-    """Return which pairs of Gaussians are near and alike enough to become one.
+    """Return which pairs of Gaussians are near and similar enough to become one.
 
-    They are near if they are closer than ``reach`` times the smaller of their sizes, and alike if their colours differ
-    by less than ``color_reach`` in every channel and neither is more than twice as large as the other.
+    They are near if they are closer than ``reach`` times the smaller of their sizes, and similar if their colours
+    differ by less than ``color_reach`` in every channel and neither is more than twice as large as the other.
 
     Parameters
     ----------

@@ -35,10 +35,10 @@ losses, meshes. Left out: the construction by tangents, which a test follows, an
 the median has no gradient here. The paper's own weights of the losses are not known to us: they are those of 2DGS.
 
 This deviates from the paper as follows. A hull is placed by the mean of its vertices, where the paper counts from the
-first; what makes a triangle a line is its altitude instead of Pearson's correlation, which depends on the axes; changes
+first; a triangle becomes a line by its altitude instead of Pearson's correlation, which depends on the axes; changes
 to more vertices are not the paper's. Primitives are as thick as training makes them, where surfels are flat; so a depth
 is that of the best plane through a primitive, which for a flat one is its own. A child of a split keeps its parent's
-vertices, as in the paper, and size limits look at deviations alone.
+vertices, as in the paper, and size limits consider deviations alone.
 """
 
 from minisplat_ref.extensions.extension import Extension

@@ -6,7 +6,7 @@ latter; it depends on the axes, and of points along one of them it is 0 or undef
 smallest altitude is below a share of a deviation.
 
 To more, which the paper does not have: a needle becomes a line along it, and a large disc a triangle in its plane.
-What a hull covers of its plane, the integral of its response over o, is by Steiner's formula::
+The area of a hull, the integral of its response over o, is by Steiner's formula::
 
     integral = s_1 s_2 (A + P sqrt(pi / 2) + 2 pi)
 
@@ -94,7 +94,7 @@ def promote_kinds(population: MixedGaussians, *, ratio: float, size_limit: float
         A needle's longest deviation over its second; of a disc, the second over the least, with the first two within
         a factor of two.
     size_limit : float
-        Least deviation of what changes, world units: the first of a needle, the second of a disc.
+        Least deviation of a primitive that changes, world units: the first of a needle, the second of a disc.
     """
     order = np.argsort(-population.log_scales, axis=1, kind="stable")
     log_s = np.take_along_axis(population.log_scales, order, axis=1).astype(np.float64)  # descending

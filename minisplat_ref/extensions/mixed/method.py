@@ -1,4 +1,4 @@
-"""How the population is trained: the recipe of 3DGS with the losses of 2D Gaussian Splatting, and changes of kind."""
+"""Training of the population: the recipe of 3DGS with the losses of 2D Gaussian Splatting, and changes of kind."""
 
 from functools import partial
 
@@ -31,7 +31,7 @@ def promote(state: TrainState, iteration: Iteration, *, ratio: float, size_fract
 
 
 def _replace_population(state: TrainState, population: MixedGaussians, changed: Bools) -> str:
-    """Replace the population; what has changed its shape loses the moments of its shape."""
+    """Replace the population; primitives that have changed shape lose the moments of their shape."""
     state.gaussians = population
     for moment in (state.adam.first, state.adam.second):
         for name in ("means", "quats", "log_scales", "vertices"):

@@ -1,8 +1,8 @@
 """The plane on which a primitive shows its surface, in NumPy, with the gradient: its depth at every pixel, its normal.
 
 The paper trains with the losses of 2D Gaussian Splatting, which need a depth at each pixel and a normal. There a ray
-meets a disc. Here a primitive has an ellipse in the image and, if its deviations are alike, no disc, so the plane is
-that of the best linear prediction of depth from image position over what the primitive holds. With the covariance K of
+meets a disc. Here a primitive has an ellipse in the image and, if its deviations are similar, no disc, so the plane is
+that of the best linear prediction of depth from image position over the primitive. With the covariance K of
 its points in the world and h the prediction's slope::
 
     K = R (diag(s^2) + kappa sum_k (a, b)_k (a, b)_k^T) R^T,   kappa = 1/6 of a line, 1/12 of a triangle
@@ -12,8 +12,8 @@ its points in the world and h the prediction's slope::
 
 kappa is the variance of a uniform segment or triangle, and p the projected mean. On a plane 1/z is linear in the image,
 so a flat primitive that is large against a pixel has the depth of its own plane exactly. Seen from its edge, or smaller
-than the low-pass eps, its plane turns towards the camera instead of running to infinity: what 2D Gaussian Splatting
-does by taking the depth of the centre. A large ball faces the camera. To first order, a depth is no more of the
+than the low-pass eps, its plane turns towards the camera instead of running to infinity, for which 2D Gaussian
+Splatting takes the depth of the centre. A large ball faces the camera. To first order, a depth is no more of the
 primitive's deviations of depth away from the mean's than its pixel is of deviations in the image.
 """
 
@@ -58,7 +58,7 @@ class PlaneGradient(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """What forward and backward pass have in common."""
+    """Terms that forward and backward pass share."""
 
     x: Floats  # [N, 3] means, camera frame
     J: Floats  # [N, 2, 3]

@@ -1,9 +1,9 @@
-"""The population of ellipses, lines and triangles, and how it begins: near points of like colour become one.
+"""The population of ellipses, lines and triangles, and its start: near points of similar colour become one.
 
 MP-GS clusters points hierarchically into groups of one, two or three, and makes each an ellipse, a line or a triangle.
 Here two points may join if one is among the three nearest neighbours of the other, no further than twice as far as the
 nearest of either, and their colours differ by less than 5 in CIE Lab; pairs join in the order of their distance, as
-long as a group has at most three points and each two of them are alike. A group's plane is that of its first two axes.
+long as a group has at most three points and any two of them are similar. A group's plane is that of its first two axes.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from minisplat_ref.types import Floats, Gaussians, Ints
 COLOR_DISTANCE = 5.0  # in Lab, the paper's
 N_NEIGHBOURS = 3
 REACH = 2.0  # of a pair, in distances of the nearest neighbours
-SHRINK = 0.5  # of a group's deviations: its hull spans what lay between its points
+SHRINK = 0.5  # of a group's deviations: its hull spans the space between its points
 SRGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 LAB_KNEE = 6 / 29
 
@@ -37,7 +37,7 @@ class MixedGaussians(NamedTuple):
     sh_rest: Floats
     vertices: Floats
     """[N, 4] a_2, b_2, a_3, b_3: the second and the third vertex from the mean, along the first two axes, world units.
-    What a line or an ellipse does not have has no effect."""
+    Vertices that a line or an ellipse lacks have no effect."""
     n_vertices: Floats
     """[N] 1 of an ellipse, 2 of a line, 3 of a triangle. Set by events, not learnt."""
 
@@ -128,7 +128,7 @@ def _measure_spread(lab: Floats) -> float:
 
 
 def to_lab(rgb: Floats) -> Floats:
-    """Return CIE Lab colours of sRGB ones, [N, 3], of D65; what is outside of [0, 1] is clipped."""
+    """Return CIE Lab colours of sRGB ones, [N, 3], of D65, after clipping to [0, 1]."""
     rgb = np.clip(rgb.astype(np.float64), 0, 1)
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     XYZ_FROM_SRGB = np.linalg.inv(SRGB_FROM_XYZ)

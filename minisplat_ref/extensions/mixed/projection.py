@@ -87,7 +87,7 @@ class Hulls(NamedTuple):
 
 
 def footprints_of(hulls: Hulls, projection: Projection, camera: Camera, conventions: Conventions) -> HullFootprints:
-    """Return what the camera sees.
+    """Return the camera's view of the hulls.
 
     Parameters
     ----------

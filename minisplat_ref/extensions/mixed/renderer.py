@@ -1,4 +1,4 @@
-"""How ellipses, lines and triangles are rendered: their colours alone, or with depths, normals and spreads.
+"""Rendering of ellipses, lines and triangles: their colours alone, or with depths, normals and spreads.
 
 Colours alone are those of :mod:`.response`, and with one vertex each 3DGS renders them. With further channels the
 colours are the same, and depths and normals come from the planes of :mod:`.planes`, by :mod:`.surfaces`. The channels
@@ -34,7 +34,7 @@ from minisplat_ref.types import Floats, Model, Projection, RenderOutput, View
 BOUNDLESS = np.array([1e-12, 0.0, 1e-12])  # px^-2: a million pixels
 PLURAL = "lines and triangles"
 DEPTHS = frozenset({"depth", "normal", "spread", "median_depth"})
-"""What only surfaces have, of all that can be wanted."""
+"""The channels that only surfaces have."""
 
 
 def channels(wants: frozenset[str]) -> dict[str, slice]:
@@ -84,7 +84,7 @@ def _surfaces_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradien
     """Gradient of :func:`_surfaces` for that with respect to vertices in the image, planes and normals."""
     v_vertices, v_planes, v_normals = v
     flat = _footprints_vjp(projected, (v_vertices,))
-    rows = np.flatnonzero(v_planes.any(axis=1) | v_normals.any(axis=1))  # only what is seen has derivatives
+    rows = np.flatnonzero(v_planes.any(axis=1) | v_normals.any(axis=1))  # only visible hulls have derivatives
     through = planes_vjp(_hulls(projected), rows, projected.camera, projected.conventions, Planes(v_planes, v_normals))
     return PayloadGradient(
         {**flat.fields, "vertices": flat.fields["vertices"] + through.vertices},
@@ -122,7 +122,7 @@ FLAT_COLORS = Payload(
 
 @functools.cache
 def with_surfaces(layout: Layout) -> Payload:
-    """Return what renders channels of depths, where a layout has them; 3DGS has no such depths, so nothing is plain."""
+    """Return the payload for a layout's channels of depths; 3DGS has no such depths, so nothing is plain."""
     return FLAT_COLORS._replace(
         response=surface_response(layout),
         response_for=functools.partial(surface_response_for, layout),

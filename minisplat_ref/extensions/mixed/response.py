@@ -1,4 +1,4 @@
-"""What the hull of one, two or three points does to a pixel, in NumPy (MP-GS, 2507.11321).
+"""The response of the hull of one, two or three points in a pixel, in NumPy (MP-GS, 2507.11321).
 
 An ellipse, a Gaussian line and a Gaussian triangle are one formula. Their vertices p_1 .. p_m share the covariance
 ``Q^-1 = L L^T``, and in whitened pixels ``y = L^-1 p`` opacity falls with the distance to the vertices' convex hull::
@@ -113,7 +113,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 class Place(NamedTuple):
-    """Where pixels lie beside hulls."""
+    """The positions of pixels relative to hulls."""
 
     nearest: Nearest
     falloffs: Floats  # [G, P] exp(-sigma)

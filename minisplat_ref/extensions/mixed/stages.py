@@ -1,6 +1,6 @@
-"""What the gradient proof checks: the renderer and all its channels, with hulls of all kinds.
+"""Stages for the gradient proof: the renderer and all its channels, with hulls of all kinds.
 
-Recorded are the edges on which pixels' hits lie, and which depths are bounded.
+The record has the edges on which pixels' hits lie, and which depths are bounded.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ N_EDGES = 3
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer; what is hit, and where the nearest points of hulls lie, is found by the reference."""
+    """Return the renderer; the reference finds the hits, and the nearest points of hulls."""
     of_all = MIXED_GAUSSIANS._replace(extend=of_all_kinds)
     return (renderer_stage(backend, setting, of_all, _sides, rng, frozenset({"depth", "normal", "spread"})),)
 

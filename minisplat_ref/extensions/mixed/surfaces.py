@@ -1,4 +1,4 @@
-"""What a hull with a plane does to a pixel: the alpha of :mod:`.response`, and a depth that every pixel has for itself.
+"""The response of a hull with a plane in a pixel: the alpha of :mod:`.response`, and a depth for every pixel.
 
 With the plane of :mod:`.planes`, p the projected mean and x the pixel's centre::
 
@@ -39,7 +39,7 @@ FIELDS = (*response.FIELDS, "planes")
 
 
 class SurfacePlace(NamedTuple):
-    """Where pixels lie on surfaces."""
+    """The positions of pixels on surfaces."""
 
     hull: Hit
     offsets: Floats  # [G, P, 2] p - x, px

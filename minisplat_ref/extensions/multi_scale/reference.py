@@ -56,7 +56,7 @@ def are_shown(cells: Floats, densities: Floats) -> Bools:
 
 
 def coverages(log_scales: Floats, opacity_logits: Floats, densities: Floats, conventions: Conventions) -> Floats:
-    """Return how many pixels wide each Gaussian appears, seen face on.
+    """Return the width in pixels of each Gaussian, seen face on.
 
     The ellipse in which alpha is at least ``alpha_min`` has, for a standard deviation s, the width::
 

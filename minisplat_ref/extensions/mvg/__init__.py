@@ -7,8 +7,8 @@ This follows MVG-Splatting, Li et al. 2024, arXiv 2407.11840, on surfels
 
 and give normals, and a pixel counts if several views agree on its depth: carried to another view and back, it returns
 within a pixel and within 1 % of its depth. A kernel density of all depths, by fast Fourier transform, has its highest
-peak; what is less than half as dense is near or far. There Gaussians are inserted on a grid, coarse near and fine far,
-as large as its spacing ``r = D / f * stride`` and turned to the normal
+peak; depths of less than half this density are near or far. There Gaussians are inserted on a grid, coarse near and
+fine far, as large as its spacing ``r = D / f * stride`` and turned to the normal
 (:mod:`minisplat_ref.extensions.mvg.insertion`). Two losses join the photometric one
 (:mod:`minisplat_ref.extensions.mvg.losses`):
 

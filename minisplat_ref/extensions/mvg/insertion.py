@@ -32,17 +32,17 @@ class Photographed(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Which pixels become points."""
+    """The choice of pixels that become points."""
 
     tolerances: Tolerances
     n_sources: int
-    """Views that are asked about a pixel: the nearest. Without a test, 0."""
+    """Views that vote on a pixel: the nearest. Without a test, 0."""
     strides: tuple[int, int, int]
     """Pixels between two points, by level: near, middle, far; 0 for no points."""
 
 
 class Insertions(NamedTuple):
-    """Points of surfaces, and what a Gaussian there looks like."""
+    """Points of surfaces, and the appearance of Gaussians there."""
 
     points: Floats
     """[M, 3] world frame."""

@@ -25,9 +25,10 @@ def depth_steps(rendered: Rendered, *, sharpness: float) -> tuple[float, Cotange
 
 
 def filtered_normals(rendered: Rendered) -> tuple[float, Cotangents]:
-    """Return how far surfels are turned away from the surface through the filtered depths, and the derivatives.
+    """Return the deviation of surfels' normals from the surface through the filtered depths, and the derivatives.
 
-    ``v_D'`` is that of :func:`minisplat_ref.mechanisms.surfels.disagreement.disagree`, ``v_D = filter_vjp(v_D')``.
+    ``v_D'`` is that of :func:`minisplat_ref.mechanisms.surfels.disagreement.disagree`; ``v_D`` follows from it
+    through the filter.
     """
     sums, alpha = rendered.channel("depth")[..., 0], rendered.output.alpha
     depth, photograph = expected_depth(sums, alpha), _photograph(rendered)

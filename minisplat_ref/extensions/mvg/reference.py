@@ -8,7 +8,7 @@ from minisplat_ref.types import Bools, Floats, Ints
 
 N_BINS = 512
 BANDWIDTH = 0.9  # Silverman's factor
-HALF = 0.5  # of the peak: what is denser is the middle
+HALF = 0.5  # of the peak: denser depths are the middle
 NEAR, MIDDLE, FAR = 0, 1, 2
 
 

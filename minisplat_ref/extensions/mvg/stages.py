@@ -1,4 +1,4 @@
-"""The stage of the gradient check: the surfels' renderer, which says on which side of its steps a point is."""
+"""The stage of the gradient check: the surfels' renderer, which records the side of its steps for each point."""
 
 import numpy as np
 

@@ -19,7 +19,7 @@ Four consequences are worth knowing:
 - A negative Gaussian in front of others dims them like any other: it adds ``-w |c|`` and takes its part of the
   transmittance. It cancels a *colour*, but makes no hole to see through. ``claims negative/backdrop`` measures this;
   ``claims negative/rings`` measures when a difference saves more Gaussians than it costs.
-- The image may be below zero, too. What is written and evaluated is clipped to [0, 1]; the loss sees it unclipped, as
+- The image may be below zero, too. Written and evaluated images are clipped to [0, 1]; the loss sees them unclipped, as
   3DGS's loss sees values above one, because a clipped pixel has no gradient.
 - Pruning considers opacity and size, never the colour, so a Gaussian whose colour is near zero, which may be about to
   change its sign, stays. That colour has a gradient, which 3DGS loses at zero.

@@ -1,8 +1,8 @@
 """OMG: few Gaussians that differ from their neighbours, with networks and codebooks.
 
-This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps what is important to
-the photographs, but of two important Gaussians side by side that look alike, one would do. So the pruning score is
-multiplied by the difference of a Gaussian's colour from its neighbours' in Morton order
+This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps the Gaussians that are
+important to the photographs, but of two important Gaussians side by side that look the same, one would suffice. So the
+pruning score is multiplied by the difference of a Gaussian's colour from its neighbours' in Morton order
 (:mod:`minisplat_ref.extensions.omg.reference`),
 
     S_i = I_i LD_i^lambda,   LD_i = mean_channels |c_i - c_prev| + |c_i - c_next|,   lambda = 2
@@ -11,7 +11,7 @@ and the Gaussians of the largest scores that together carry tau = 99 % of the su
 (:mod:`minisplat_ref.extensions.omg.method`). From iteration 15,000 on a Gaussian has six features instead of opacity
 and 48 coefficients of colour; small networks compute these from the features and from the place
 (:mod:`minisplat_ref.extensions.omg.decoding`). From 29,000 on scales, rotations and features are split into parts of
-one or two numbers, each part is an index into a codebook of its own (:mod:`minisplat_ref.extensions.omg.svq`), and the
+one or two numbers, each part is an index into a separate codebook (:mod:`minisplat_ref.extensions.omg.svq`), and the
 codebooks are trained. ``.omg`` is the file: of a training (:mod:`minisplat_ref.extensions.omg.trained_file`), or fitted
 to any Gaussians (:mod:`minisplat_ref.extensions.omg.file`).
 
@@ -21,10 +21,10 @@ to any Gaussians (:mod:`minisplat_ref.extensions.omg.file`).
     python -m data_tools.claims omg/distinctiveness room --out DIR
     python -m data_tools.claims omg/files room --out DIR
 
-What networks and codes make is written into the six fields of 3DGS in every iteration, so ``point_cloud.ply`` is one
-that every viewer draws and every format can hold. ``docs/FAMILY.md`` has the measured figures.
+The output of networks and codes is written into the six fields of 3DGS in every iteration, so every viewer can show
+``point_cloud.ply`` and every format can hold it. ``docs/FAMILY.md`` has the measured figures.
 
-Where the paper says nothing, this is chosen here: the networks begin with the outputs that the Gaussians had; their
+Choices of ours where the paper is silent: the networks begin with the outputs that the Gaussians had; their
 learning rates; that their gradient does not reach the centres; the radius in which the scene is not contracted; and
 codebooks of few Gaussians, which are smaller (at most one code for eight). It deviates from the paper in the file:
 centres are packed as differences in Morton order instead of by a point-cloud coder, and indices by zstandard instead of

@@ -22,7 +22,7 @@ def to_halves(values: Floats, name: str) -> Floats:
     Raises
     ------
     InputError
-        They are too large; ``name`` says what they are.
+        They are too large; ``name`` is their name.
     """
     if not np.abs(values).max(initial=0.0) <= LARGEST_HALF:
         raise InputError(

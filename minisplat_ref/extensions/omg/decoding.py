@@ -11,7 +11,7 @@ where the four are networks of one hidden layer of 64 leaky ReLUs. Where a Gauss
 the rows of its parts' codebooks, ``x = (B_1[i_1], B_2[i_2], ...)``.
 
 The derivative through gamma is left out: p is a constant of the gradient. The highest octave turns 2^15 times as fast
-as the lowest, and what it says of a centre is noise.
+as the lowest, and its value at a centre is noise.
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ Shared = Mapping[str, Floats]
 
 
 class Decoded(NamedTuple):
-    """What networks computed, and what their gradient needs."""
+    """The output of the networks, and the values that their gradient needs."""
 
     color: Floats
     """[N, 3] c."""

@@ -9,9 +9,9 @@ appearance       2 numbers per part  degree 0 (3 numbers) and the features of th
 ===============  ==================  =======================================================================
 
 Codebooks and decoder are half floats. Indices and centres are planes of bytes that zstandard packs, where the paper
-uses Huffman coding, a point-cloud coder and xz. The error has no bound other than the codebooks; ``describe`` says how
-many codes there are. Decoding gives the same Gaussians on every machine except for the last bit of the higher
-harmonics, which are a matrix product.
+uses Huffman coding, a point-cloud coder and xz. The error has no bound other than the codebooks; ``describe`` reports
+the number of codes. Decoding gives the same Gaussians on every machine except for the last bit of the higher harmonics,
+which are a matrix product.
 """
 
 import math
@@ -170,7 +170,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     raw = unpack(packed, "decoder", 2 * (1 + header.n_features) * 3 * n_rest)
     table = np.frombuffer(raw, "<f2").reshape(1 + header.n_features, 3 * n_rest)
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
-    with np.errstate(over="ignore", invalid="ignore"):  # of damaged files; what is not finite is refused
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged files; values that are not finite are refused
         harmonics = Decoder(table[0], table[1:]).harmonics(features)
         means = np.asarray(header.center, np.float32) + offsets.astype(np.float32)
     gaussians = Gaussians(

@@ -68,7 +68,7 @@ def start_networks(state: TrainState, iteration: Iteration) -> None:
     """Replace opacity and colour by features: static ones that are the colours, and view features of zero.
 
     The networks begin with the outputs that the Gaussians had, as nearly as their last layers can be fitted, and
-    without an influence of the place. The paper does not say how its networks begin.
+    without an influence of the place. The paper does not define the start of its networks.
     """
     g, n = state.gaussians, n_rows(state.gaussians)
     features = np.concatenate([g.sh_dc, np.zeros((n, N_VIEW), g.means.dtype)], axis=1)
@@ -162,7 +162,7 @@ def round_centres(state: TrainState, iteration: Iteration) -> None:
 
 
 def write_fields(state: TrainState, iteration: Iteration) -> None:
-    """Write into the fields of 3DGS what networks and codebooks make of features and codes.
+    """Write into the fields of 3DGS the values that networks and codebooks decode from features and codes.
 
     Nothing reads them during the training. But a file has these fields alone, and may be written after any iteration.
     """
@@ -176,7 +176,7 @@ _start_codes = partial(start_codes, scale_codes=64, rotation_codes=512, feature_
 
 
 def _with_ours(event: Event) -> tuple[Event, ...]:
-    """Return an event of Mini-Splatting as OMG has it, and what comes after it."""
+    """Return an event of Mini-Splatting as OMG has it, and the events after it."""
     if does(event, prune_tail):
         return (event._replace(action=_prune),)
     return (event, At(NETWORKS_FROM, start_networks)) if does(event, restart_from_means) else (event,)

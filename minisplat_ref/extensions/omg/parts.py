@@ -1,4 +1,4 @@
-"""What both kinds of ``.omg`` store alike: the place of centres, integers in planes of bytes, codes with indices."""
+"""Parts that both kinds of ``.omg`` store in the same way: centres, integers in planes of bytes, codes with indices."""
 
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol
@@ -16,7 +16,7 @@ GAUSSIANS_MAX = 2**31 - 1
 
 
 class Header(Protocol):
-    """What is read of a header here."""
+    """The entries of a header that are read here."""
 
     @property
     def n(self) -> int:

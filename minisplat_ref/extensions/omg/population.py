@@ -1,9 +1,9 @@
-"""What OMG trains: Gaussians with few features, the networks that read them, and codebooks.
+"""The population of OMG: Gaussians with few features, the networks that read them, and codebooks.
 
 Three parts of a training follow one another. At first the population is that of 3DGS: ``features`` and ``codes`` have
-no columns. Then six features take the place of opacity and colour, and networks compute these. In the end scales,
-rotations and features are indices into codebooks, and the codebooks are trained. The shapes of the arrays say which
-part it is; nothing else does.
+no columns. Then six features replace opacity and colour, and networks compute these. In the end scales,
+rotations and features are indices into codebooks, and the codebooks are trained. The shapes of the arrays alone
+determine which part it is.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from minisplat_ref.mechanisms.networks.mlp import make_network, network_rates, t
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.types import Floats, Gaussians, Scene
 
-N_STATIC, N_VIEW = 3, 3  # features of a Gaussian: T, for colour and opacity, and V, for what depends on the view
+N_STATIC, N_VIEW = 3, 3  # features of a Gaussian: T, for colour and opacity, and V, for view dependence
 N_SPACE = 13  # features of a place, F
 N_OCTAVES = 16
 HIDDEN = 64
@@ -67,18 +67,18 @@ def with_features(gaussians: Gaussians, rng: np.random.Generator) -> OmgGaussian
 
 
 def save_plain(path: str | Path, gaussians: Any, label: Label) -> None:
-    """Write the six fields of 3DGS, into which the recipe's last event has written what features and codes say."""
+    """Write the six fields of 3DGS, into which the recipe's last event has decoded features and codes."""
     save_ply(path, Gaussians(*gaussians[: len(Gaussians._fields)]), label)
 
 
 def load_plain(path: str | Path, population: Any) -> Gaussians:
-    """Read the six fields, whatever the population's type: its renderer draws them as 3DGS does."""
+    """Read the six fields, whatever the population's type: its renderer treats them as 3DGS does."""
     gaussians: Gaussians = load_ply(path)
     return gaussians
 
 
 def initial_shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
-    """Return random networks, empty codebooks, and the place of the scene, float32; ``rng`` itself draws nothing."""
+    """Return random networks, empty codebooks, and the bounds of the scene, float32; ``rng`` itself is not advanced."""
     shared: dict[str, Floats] = {}
     (rng,) = rng.spawn(1)  # so that until there are features, a training is that of Mini-Splatting
     for name, sizes in SIZES.items():
@@ -108,4 +108,5 @@ RATES = Rates(
     },
     frozenset(),
 )
-"""Codes have the rates of 3DGS for what they hold, features that of its colours. The networks' is chosen here."""
+"""Codes have the rates of 3DGS for the fields that they hold, features that of its colours. The networks' is chosen
+here."""

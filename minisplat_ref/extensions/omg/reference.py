@@ -16,7 +16,7 @@ from minisplat_ref.types import Floats
 
 
 def local_distinctiveness(means: Floats, colors: Floats) -> Floats:
-    """Return how much each colour differs from those before and after it in Morton order.
+    """Return the difference of each colour from those before and after it in Morton order.
 
     Parameters
     ----------

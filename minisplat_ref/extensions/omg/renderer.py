@@ -1,4 +1,4 @@
-"""The renderer: features and codes become Gaussians, which 3DGS draws."""
+"""The renderer: features and codes become Gaussians, which 3DGS renders."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -43,7 +43,7 @@ def is_plain(gaussians: Any) -> bool:
 
 
 def decode(model: Model, networks: Networks, encode: Encode = encode_places) -> tuple[OmgGaussians, Tape]:
-    """Return the population with all fields of 3DGS as they are drawn, and the tape.
+    """Return the population with all fields of 3DGS as they are rendered, and the tape.
 
     ``encode`` returns the encoded places, which are constants of the gradient.
     """
@@ -63,7 +63,7 @@ def decode(model: Model, networks: Networks, encode: Encode = encode_places) -> 
 def decode_vjp(tape: Tape, v: OmgGaussians) -> tuple[OmgGaussians, dict[str, Floats]]:
     """Gradient of :func:`decode` with respect to the population and the shared parameters.
 
-    What networks and codebooks replace gets zeros: it is not read.
+    Fields that networks and codebooks replace get zeros: they are not read.
     """
     shared, v_shared = tape.model.shared, dict[str, Floats]()
     if tape.decoded is not None:
@@ -85,7 +85,7 @@ def make_renderer(encode: Encode = encode_places) -> Renderer:
     """Return the renderer; ``encode`` as for :func:`decode`."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, tuple[Any, Tape | None]]:
-        """Decode, and draw as 3DGS does."""
+        """Decode, and render as 3DGS does."""
         if is_plain(model.gaussians):
             output, inner = SPLATTING.render(model, view, request)
             return output, (inner, None)

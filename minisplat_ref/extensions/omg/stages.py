@@ -1,7 +1,7 @@
-"""What the gradient check looks at: the renderer with its networks, and with codebooks in their place.
+"""Stages for the gradient check: the renderer with its networks, and with codebooks instead.
 
-The networks are as those of the recipe, but small: every weight is checked. Places are constants of the gradient
-(:mod:`.decoding`), so they are held here, too. A leaky ReLU has a kink at 0, where differences are refused.
+The networks are as those of the recipe, but small: every weight is checked. Positions are constants of the gradient
+(:mod:`.decoding`), so they are fixed here, too. A leaky ReLU has a kink at 0, where differences are refused.
 """
 
 import numpy as np
@@ -66,7 +66,7 @@ def _networks(n_harmonics: int, rng: np.random.Generator) -> dict[str, Floats]:
 def _stage(
     backend: Backend, setting: Setting, population: OmgGaussians, shared: dict[str, Floats], rng: np.random.Generator
 ) -> Stage:
-    """Return the renderer as a function of what is read of a population and of the shared parameters."""
+    """Return the renderer as a function of the fields of a population that are read, and of the shared parameters."""
     encoding = IN_NUMPY.fourier(setting.gaussians.means, N_OCTAVES)
     has_codes = population.codes.shape[1] > 0
     held = (*REPLACED, "codes", *(FIELDS.values() if has_codes else ()))

@@ -45,7 +45,7 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
     Parameters
     ----------
     vectors : ndarray of shape (N, D)
-        Finite, at most 65504 in magnitude, which is what float16 holds.
+        Finite, at most 65504 in magnitude, the largest float16.
     width : int
         w, numbers per part; it divides D.
     n_codes : int
@@ -75,7 +75,7 @@ def fit_codes(vectors: Floats, n_codes: int) -> Floats:
 
 
 def unit_quats(quats: Floats) -> Floats:
-    """Return quaternions [N, 4] of length 1 with w >= 0, one of the two that stand for each rotation."""
+    """Return quaternions [N, 4] of length 1 with w >= 0, one of the two that represent each rotation."""
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     return unit * np.where(unit[:, :1] < 0, unit.dtype.type(-1), unit.dtype.type(1))
 

@@ -1,6 +1,6 @@
 """``.omg`` of a training: its codes, codebooks and networks, as they were trained.
 
-The other ``.omg`` (:mod:`.file`) is fitted to any Gaussians; both are read alike. Streams:
+The other ``.omg`` (:mod:`.file`) is fitted to any Gaussians; both are read in the same way. Streams:
 
 ===============  ==========================================================================
 means            half floats of the offset from the scene's centre, as differences
@@ -9,7 +9,7 @@ NAME codes       the codes that are in use, half floats
 networks         weights and biases of all networks, one after the other, half floats
 ===============  ==========================================================================
 
-Codebooks and weights lose what half floats lose; the rest is as it was trained. Opacity, colour and harmonics are
+Codebooks and weights are rounded to half floats; the rest is as it was trained. Opacity, colour and harmonics are
 products of matrices, so their last digits depend on the machine.
 """
 
@@ -118,7 +118,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         columns.append(found.indices.astype(np.float32))
     offsets = from_differences(parts.read_integers(packed, header, "means", 3)).astype(np.float32)
     shared[PLACE] = np.array([0, 0, 0, header.inverse_radius])
-    # of damaged files; what is not finite is refused
+    # of damaged files; values that are not finite are refused
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         coded = OmgGaussians(
             means=offsets,
@@ -181,7 +181,7 @@ def _check_header(packed: Packed) -> _Header:
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return what a file stores, as pairs of name and text.
+    """Return the content of a file, as pairs of name and text.
 
     Raises
     ------

@@ -12,14 +12,14 @@ The ray of each pixel takes alpha where it hits the polygon:
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
 (``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with a polygon instead of an ellipsoid
-(:mod:`.ray_kernels`, in NumPy :mod:`.reference`). An edited polygon may be bent, and then the triangles between its
-centre and two neighbouring corners are what a ray hits (:mod:`.kernels`); of a flat one, both give the same hits.
+(:mod:`.ray_kernels`, in NumPy :mod:`.reference`). An edited polygon may be bent, and then a ray hits the triangles
+between its centre and two neighbouring corners (:mod:`.kernels`); of a flat one, both give the same hits.
 
 A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The corners of an edited polygon are fitted by
 spans, whose ellipse is the Gaussian. Every affine edit is carried exactly.
 
 This deviates from the paper, which recovers a Gaussian from three vertices by Gram-Schmidt and so loses shear; here all
-corners are fitted, and ``claims polygons/edits`` measures the paper's way beside it. A ray has any number of hits,
+corners are fitted, and ``claims polygons/edits`` measures the paper's way, too. A ray has any number of hits,
 sorted exactly. The thickness is 1e-5 where training starts and has no effect on an image; it keeps its ratio under an
 edit. A Gaussian is flattened along whichever axis is its thinnest. Training starts from balls, whose planes are chosen
 at random; its loss and schedule are those of 3DGS. Hits of alpha below ``alpha_min`` = 1/255 do not count.

@@ -35,7 +35,7 @@ def polygons_of(population: Any, opacities: Floats, n_sides: int = N_SIDES) -> P
     population : Gaussians, or a NamedTuple with its fields
         N rows; the least scale of each does not matter.
     opacities : ndarray of shape (N,)
-        Activated, and 0 where a Gaussian is not to be drawn.
+        Activated, and 0 where a Gaussian is not rendered.
     n_sides : int
         3 or more.
     """

@@ -10,9 +10,9 @@ In standard deviations both corners are r from the centre, at an angle of ``2 pi
 
     u^2 + v^2 = r^2 (b_1^2 + b_2^2 + 2 b_1 b_2 cos(2 pi / n))
 
-Nothing here knows a plane of the whole polygon, or its axes: these kernels draw the fans of an edited mesh, in which
-neither is left; whole polygons are traced by :mod:`.ray_kernels`. Of a spoke, the triangle before it has the points; of
-the centre, the first triangle. Neighbours take the same product ``p . e``, and so no ray slips through between them.
+There is no plane of the whole polygon here, and no axes: these kernels render the fans of an edited mesh, which has
+neither; whole polygons are traced by :mod:`.ray_kernels`. Of a spoke, the triangle before it has the points; of the
+centre, the first triangle. Neighbours take the same product ``p . e``, and so no ray slips through between them.
 
 The loops are those of ``mechanisms.rays.traversal`` and ``mechanisms.rays.kernels``.
 """

@@ -1,4 +1,4 @@
-"""How polygons are drawn by rays through the pixels, how training starts, and the recipe."""
+"""The ray-tracing renderer of polygons, the start of training, and the recipe."""
 
 import numpy as np
 
@@ -15,11 +15,11 @@ from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Gaussians
 
-LOG_THICKNESS = float(np.log(1e-5))  # of the axis across, as in the paper; what is drawn has none
+LOG_THICKNESS = float(np.log(1e-5))  # of the axis across, as in the paper; rendering has none
 
 
 def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -> Tracer:
-    """Return how a backend traces: every ray against every polygon, or kernels with a tree of polygons."""
+    """Return the tracer of a backend: every ray against every polygon, or kernels with a tree of polygons."""
     if backend.is_compiled:
         return kernels.tracer_of(POLYGON, tree_of(polygons, conventions))
     return blending.tracer_of(prepare_meeting(polygons))

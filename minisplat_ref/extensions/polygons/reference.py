@@ -1,4 +1,4 @@
-"""A ray and a flat Gaussian in its polygon, in NumPy; ``mechanisms.rays.blending`` has what a ray sees of many of them.
+"""A ray and a flat Gaussian in its polygon, in NumPy; ``mechanisms.rays.blending`` blends many of them along a ray.
 
 REdiSplats, section 3. The spans ``S_a = s_a e_a`` and ``S_b = s_b e_b`` are perpendicular, and so the ray ``O + t d``
 meets the plane of the Gaussian around mu at the place (u, v), in standard deviations:
@@ -113,7 +113,7 @@ def meet_vjp(
 
 
 def prepare_meeting(polygons: Polygons) -> Meeting:
-    """Return how rays meet these polygons."""
+    """Return the intersection of rays with these polygons."""
 
     def alphas_and_depths(rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> tuple[Floats, Floats]:
         found = meet(polygons, rays, ray_ids, gaussian_ids)

@@ -4,10 +4,10 @@ The file is a PLY in float64. Polygon m has the vertices ``m n`` to ``m n + n - 
 the opacity and the colour of degree 0 of its Gaussian. Gaussians that are too faint to have a polygon are not in it
 (:func:`~minisplat_ref.mechanisms.meshes.fans.opacity_radii`), nor are those of no finite size.
 
-After an edit, face m says which vertices are the corners of polygon m, in the order in which they were written. What an
-edit changed is fitted (:func:`~minisplat_ref.mechanisms.meshes.fans.fit_flat_gaussians`): means, quaternions and
-scales. The thickness keeps its ratio to the smaller of the two scales, so that the plane stays the plane. Higher
-harmonics are rotated by the rotation that is nearest to what happened to the plane. Opacities, and with them the radii,
+After an edit, face m lists the vertices that are the corners of polygon m, in the order in which they were written.
+Edited polygons are fitted (:func:`~minisplat_ref.mechanisms.meshes.fans.fit_flat_gaussians`): means, quaternions
+and scales. The thickness keeps its ratio to the smaller of the two scales, so that the plane stays the plane. Higher
+harmonics are rotated by the rotation that is nearest to the map of the plane. Opacities, and with them the radii,
 stay. A polygon has two sides that look the same: a mirrored one counts as turned over, and colours are never mirrored.
 """
 
@@ -135,7 +135,7 @@ def load_corners(path: str | Path, n_polygons: int) -> NDArray:
 
 
 def carry_gaussians(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Path) -> tuple[Gaussians, int]:
-    """Return the Gaussians after an edit of their polygons, and how many it changed.
+    """Return the Gaussians after an edit of their polygons, and the number of changed ones.
 
     Parameters
     ----------

@@ -4,8 +4,8 @@ A Gaussian under an affine map is a Gaussian, so nothing is approximated in its 
 
     mu' = A mu + b,   Sigma' = A Sigma A^T
 
-(``mechanisms.editing.deformation`` says how the covariance becomes a quaternion and scales again, and how colours
-rotate). A Gaussian belongs to a selection if its centre does; one that straddles the border is not cut.
+(``mechanisms.editing.deformation`` has the factorisation of the covariance into a quaternion and scales, and the
+rotation of colours). A Gaussian belongs to a selection if its centre does; one that straddles the border is not cut.
 """
 
 import math
@@ -49,7 +49,7 @@ def about_point(linear: Floats, pivot: Floats, translation: Floats) -> Affine:
 
 
 def rotation_about(axis_angle: Sequence[float]) -> Floats:
-    """Return the rotation by a vector whose direction is the axis and whose length is the angle, in degrees.
+    """Return the matrix of a rotation vector: its direction is the axis, its length the angle, in degrees.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ so the code computes F and not L. The covariance is refactored by singular value
 Two things are exact. When the mesh is translated, rotated and scaled, so are the Gaussians; and an affine map within
 the plane of a triangle acts exactly on them. Triangles whose corners have not moved leave their Gaussians as they are,
 to the byte. The rest is approximate: a bent surface becomes flat pieces, and a Gaussian that crosses a side of its
-triangle follows only the one that it is bound to. Corners say nothing of a stretch across their plane; in that
+triangle follows only the one that it is bound to. Corners do not determine a stretch across their plane; in that
 direction a Gaussian grows as h does, with the square root of the area. Beyond the border of the mesh and far from its
 surface the map of the nearest triangle is extrapolated, which magnifies its rotation; ``reach`` leaves Gaussians alone
 that are farther away. Inside a hull around a solid object, Gaussians on either side of the middle belong to opposite
@@ -126,7 +126,7 @@ def rebuild(deformed_mesh: Mesh, binding: Binding) -> Gaussians:
     E_rest, E = frames(rest), frames(deformed_mesh)  # [T, 3, 3]
     is_still = (deformed_mesh.corners == rest.corners).all(axis=(1, 2))  # [T]
     F = np.where(is_still[:, None, None], np.eye(3), E @ np.linalg.inv(E_rest))
-    F = np.concatenate([F, np.eye(3)[None]])  # the last, row -1, is that of what is not bound
+    F = np.concatenate([F, np.eye(3)[None]])  # the last, row -1, is that of Gaussians that are not bound
     faces = binding.faces
     is_carried = (faces != UNBOUND) & ~is_still[faces]  # [N]
     carried = (

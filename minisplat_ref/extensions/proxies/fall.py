@@ -31,7 +31,7 @@ from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, load_mesh, sa
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Camera, Floats
 
-STEP_FRACTION = 0.2  # of the longest stable step; the study proxies/sheet measures what it does to the energy
+STEP_FRACTION = 0.2  # of the longest stable step; the study proxies/sheet measures its effect on the energy
 FLOOR_DEPTH = 0.02  # how far the floor gives way under a sheet that lies on it, in mean edges
 IMAGE_SIZE = (480, 360)  # pixels, without --cameras
 
@@ -74,7 +74,7 @@ def sheet_of(mesh: Mesh, setting: Setting) -> Sheet:
     if setting.drop is not None:
         height = float((mesh.vertices @ (-setting.gravity / g)).min()) - setting.drop
         k = float(masses.mean()) * g / (FLOOR_DEPTH * float(springs.rest_lengths.mean()))
-        floor = Floor(height, k, drag=2 * float(np.sqrt(k / masses.mean())))  # critical: no vertex bounces by itself
+        floor = Floor(height, k, drag=2 * float(np.sqrt(k / masses.mean())))  # critical: no vertex bounces alone
     return Sheet(masses, springs, setting.is_pinned, setting.gravity, setting.drag, floor)
 
 
@@ -120,7 +120,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Bind, then for each frame simulate, rebuild, draw and write."""
+    """Bind, then for each frame simulate, rebuild, render and write."""
     _check(args)
     gaussians, mesh, label = load_model(args.model), load_mesh(args.mesh), load_label(args.model)
     setting = Setting(np.array(args.gravity), _select_pinned(args, mesh), args.stretch, args.drag, args.floor)

@@ -1,8 +1,8 @@
 """A falling sheet of masses and springs: forces, energies, and velocity Verlet.
 
 Vertices have masses m, springs pull with ``k (l - l0)`` along themselves, gravity g pulls everything, a floor pushes
-back what is below it with ``k_f`` times its depth, and drag slows everything down, ``dv/dt = -c v``. Pinned vertices do
-not move. The forces other than drag are minus the gradient of
+vertices below it back with ``k_f`` times their depth, and drag slows everything down, ``dv/dt = -c v``. Pinned vertices
+do not move. The forces other than drag are minus the gradient of
 
     elastic + floor + gravity = sum_s k (l - l0)^2 / 2  +  sum_v k_f depth^2 / 2  -  sum_v m g . x
 
@@ -12,9 +12,9 @@ A step of length h is symmetric. It takes half a step of drag, half a kick, a dr
 
 The middle is velocity Verlet. It is of second order, exact in free fall, and symplectic, so that its error of the
 energy is of order h^2 and does not grow with time. Drag is solved exactly, so the energy that it takes away is known
-exactly: kinetic, elastic, floor and gravitational energy and what was dissipated add up to the energy at the start, to
-within that error. This sum checks a simulation. Verlet is stable for ``h < 2 / omega`` with the highest frequency omega
-of the sheet, which :func:`longest_step` bounds.
+exactly: kinetic, elastic, floor and gravitational energy and the dissipated energy add up to the energy at the start,
+to within that error. This sum checks a simulation. Verlet is stable for ``h < 2 / omega`` with the highest frequency
+omega of the sheet, which :func:`longest_step` bounds.
 
 Most cloth simulations use implicit Euler instead. It can take long steps because it damps, but by an amount that
 depends on the step and that nothing accounts for. Left out are collisions of the sheet with itself and with other
@@ -30,14 +30,14 @@ from minisplat_ref.types import Bools, Floats
 
 
 class Floor(NamedTuple):
-    """A plane perpendicular to gravity, which pushes up what is below it."""
+    """A plane perpendicular to gravity, which pushes up vertices below it."""
 
     height: float
     """Along the direction opposite to gravity, world units."""
     stiffness: float
     """k_f, force per depth on each vertex."""
     drag: float
-    """1 / time, on vertices below the floor, besides the drag on all; it stands for friction and inelastic loss."""
+    """1 / time, on vertices below the floor, besides the drag on all; it models friction and inelastic loss."""
 
 
 class Sheet(NamedTuple):

@@ -1,4 +1,4 @@
-"""The springs of a triangle mesh, and the masses of its vertices: what a sheet of cloth is made of.
+"""The springs of a triangle mesh, and the masses of its vertices, as a model of a sheet of cloth.
 
 A sheet of masses and springs (Provot 1995) has springs of three kinds, which here follow from the triangles:
 

@@ -8,8 +8,8 @@ of the pixel's ray ``O + t d`` where its density is greatest:
 
 Each ray blends its own hits in the order of t, with the weights of 3DGS. So ellipsoids are exact at any angle, no
 Gaussian pops in front of another when the camera turns, and rays may start anywhere: shadows, mirrors, glass and
-triangles need no new formula (:mod:`.lights`). A bounding volume hierarchy skips what a ray does not come near
-(``mechanisms.rays.bvh``).
+triangles need no new formula (:mod:`.lights`). A bounding volume hierarchy skips Gaussians that a ray does not come
+near (``mechanisms.rays.bvh``).
 
 This deviates from the paper as follows. A Gaussian ends where alpha falls below ``alpha_min`` = 1/255, as in 3DGS, and
 not at the ellipsoid of 99 %, which is nearly the same for an opaque one. A ray has any number of hits, where the

@@ -17,7 +17,7 @@ class Whitened(NamedTuple):
     means: Floats
     """[N, 3] world frame."""
     maps: Floats
-    """[N, 3, 3] ``M = diag(1/s) R^T``; not finite where a Gaussian cannot be drawn."""
+    """[N, 3, 3] ``M = diag(1/s) R^T``; not finite where a Gaussian cannot be rendered."""
     opacities: Floats
     """[N] in [0, 1]."""
 

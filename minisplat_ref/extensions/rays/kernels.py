@@ -42,7 +42,7 @@ def nearest_point(p0, p1, p2, v0, v1, v2):
 
 @scalar
 def meet(records, row, ray):
-    """Return t and q of eight rays; q is infinite where alpha is below its least value, and where it is no number."""
+    """Return t and q of eight rays; q is infinite where alpha is below its minimum, and where it is not a number."""
     t, e0, e1, e2 = nearest_point(*whiten_ray(records, row, ray))
     q = e0 * e0 + e1 * e1 + e2 * e2
     return t, select(q <= records[row, REACH], q, np.inf)

@@ -25,7 +25,7 @@ def whiten_model(model: Model) -> Whitened:
 
 
 def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
-    """Return how a backend traces: every ray against every Gaussian, or kernels with a tree, which is built here."""
+    """Return the tracer of a backend: every ray against every Gaussian, or kernels with a tree, which is built here."""
     if backend.is_compiled:
         return kernels.tracer_of(RESPONSE, tree_of(gaussians, conventions))
     return blending.tracer_of(prepare_meeting(gaussians))

@@ -1,4 +1,4 @@
-"""A ray and a 3D Gaussian, in NumPy; what a ray sees of many of them is in ``mechanisms.rays.blending``.
+"""A ray and a 3D Gaussian, in NumPy; ``mechanisms.rays.blending`` blends many of them along a ray.
 
 This is section 3 of RaySplats. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu to the unit ball. On the ray
 ``O + t d``
@@ -98,7 +98,7 @@ def intersect_vjp(
 
 
 def prepare_meeting(gaussians: Whitened) -> Meeting:
-    """Return how rays meet these Gaussians."""
+    """Return the intersection of rays with these Gaussians."""
 
     def alphas_and_depths(rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> tuple[Floats, Floats]:
         found = intersect(gaussians, rays, ray_ids, gaussian_ids)

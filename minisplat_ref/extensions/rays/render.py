@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref rays render``, which draws a trained scene among lights, mirrors, glass and meshes."""
+"""The command ``minisplat-ref rays render``: a trained scene among lights, mirrors, glass and meshes."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the gradient proof checks."""
+"""Stages for the gradient proof."""
 
 from collections.abc import Mapping
 

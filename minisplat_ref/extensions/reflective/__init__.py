@@ -7,8 +7,8 @@ shaded once by an environment in latitude and longitude, whose texels are learne
 
     c = a (1 - m) E(n) + (F_0 S + B) L,   F_0 = 0.04 (1 - m) + a m,   L = V L_env(r, roughness) + (1 - V) L_around
 
-r is the reflected ray, V how much of the environment it sees past the surfels, and L_around the light that each surfel
-receives from around instead, its spherical harmonics in the direction r. Training has three stages:
+r is the reflected ray, V the fraction of the environment that it sees past the surfels, and L_around the light that
+each surfel receives from around instead, its spherical harmonics in the direction r. Training has three stages:
 
     1        each surfel is shaded by itself and then blended, which is more forgiving while normals are wrong
     18,000   shading per pixel
@@ -26,10 +26,10 @@ mirrors spread (:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on n
 ``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper as follows. Reflected rays meet the surfels, not a mesh that is extracted now and then, and
-V is what comes through. The environment has 32 x 64 texels; its averages are exact matrices instead of samples, and
-what a matte surface sees is held by nine harmonics. The date of occlusion, the strength of the disturbance and what
-counts as a mirror are ours. Light is linear and shown as sRGB. Left out are light that is reflected twice, and the
-environment as the background of the image.
+V is their transmittance. The environment has 32 x 64 texels; its averages are exact matrices instead of samples, and
+nine harmonics hold the light on a matte surface. The date of occlusion, the strength of the disturbance and what counts
+as a mirror are ours. Light is linear and shown as sRGB. Left out are light that is reflected twice, and the environment
+as the background of the image.
 """
 
 from minisplat_ref.extensions.extension import Extension

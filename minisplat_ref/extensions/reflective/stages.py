@@ -1,4 +1,4 @@
-"""The stages of the gradient check: shading surfel by surfel, and pixel by pixel with what hides the environment."""
+"""The stages of the gradient check: shading surfel by surfel, and pixel by pixel with occlusion."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ from minisplat_ref.rendering.backends import Backend
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return both; the second has the name of the whole renderer and takes the place of its check."""
+    """Return both; the second has the name of the whole renderer and replaces its check."""
     stage_of = partial(
         shading_stage, backend, setting, rng, SHADED, render=partial(render, mirrors=True), shaded=lambda tape: tape
     )

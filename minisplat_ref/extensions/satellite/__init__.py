@@ -24,7 +24,7 @@ renders.
 
 This deviates from the paper as follows. Altitudes are divided by alpha; where almost nothing is, alpha counts as 0.05.
 The exponent 0.4 and the limit 0.3 are per metre. Rates, the nearly transparent start, the random background and the
-opacity of what is pruned are ours: points in a volume begin as a fog, and on black a translucent surface of bright
+opacity threshold of pruning are ours: points in a volume begin as a fog, and on black a translucent surface of bright
 colours looks like an opaque one. The start helps a ground at the lowest altitude (:mod:`.method`).
 
 Left out are the registration of a surface model to a reference, panchromatic images and sensors whose RPC has to be

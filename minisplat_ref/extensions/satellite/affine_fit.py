@@ -1,4 +1,4 @@
-"""The affine camera that fits a sensor best, and how far it is from the sensor (EOGS, Sec. 3.1).
+"""The affine camera that fits a sensor best, and its error (EOGS, Sec. 3.1).
 
 World coordinates are metres of UTM from a centre, over a scale. Pixels and altitude of the sensor are affine in them::
 
@@ -105,9 +105,9 @@ def fit_affine(
 
 
 def frame_of(rpcs: list[RPC], size: tuple[int, int], altitudes: tuple[float, float]) -> Frame:
-    """Return the frame of a scene: centred on what the middle of the first image sees, its half diagonal is 1.
+    """Return the frame of a scene: centred on the middle of the first image, with a half diagonal of 1.
 
-    The origin is at the lowest altitude, as which the renderer counts what is nearly transparent.
+    The origin is at the lowest altitude, which the renderer assigns to nearly transparent pixels.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Gaussians, Scene
 
 ITERATIONS = 5_000
-START_OPACITY, START_SIZE = 0.005, 0.5  # of what fills the volume; size relative to the distance of neighbours
+START_OPACITY, START_SIZE = 0.005, 0.5  # of points in the volume; size relative to the distance of neighbours
 SKY_LIGHT = 0.05  # k at the start
 
 
@@ -46,7 +46,7 @@ def begin_transparent(state: TrainState, iteration: Iteration, *, opacity: float
 
 
 def hold_sky(state: TrainState, iteration: Iteration) -> None:
-    """Keep the light in shadows between none and the sun's: while surfaces are unsettled, its gradient knows no end."""
+    """Keep the light in shadows between none and the sun's: while surfaces are unsettled, its gradient is unbounded."""
     np.clip(state.shared[IN_SHADOW], 0, 1, out=state.shared[IN_SHADOW])
 
 

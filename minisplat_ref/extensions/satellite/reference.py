@@ -7,8 +7,8 @@ sun sees altitude h_s. Higher than h, something is between::
     s = exp(0.4 min(h - h_s, 0))
     I = (s + (1 - s) k) (C a + c)
 
-a is the albedo that splatting renders, C [3, 3] and c [3] the radiometry of the photograph, and k [3] what the sky
-lights in the shadow.
+a is the albedo that splatting renders, C [3, 3] and c [3] the radiometry of the photograph, and k [3] the light of the
+sky in the shadow.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ import numpy as np
 from minisplat_ref.types import Bools, Floats, Ints
 
 DARKENING = 0.4  # per unit of altitude, a metre
-MIN_ALPHA = 0.05  # what is fainter has no altitude; it counts as if it were as opaque
+MIN_ALPHA = 0.05  # fainter pixels have no altitude; they count as if they were as opaque
 
 
 class AltitudeGradient(NamedTuple):
@@ -48,7 +48,7 @@ def altitudes_vjp(sums: Floats, alpha: Floats, v_altitudes: Floats) -> AltitudeG
 
 
 class Sample(NamedTuple):
-    """Where pixels are read between the pixels of an image, with the values there."""
+    """The places between the pixels of an image that are read, with the values there."""
 
     values: Floats  # [H, W, D]
     corners: Ints  # [4, H, W] flat indices
@@ -97,7 +97,7 @@ def sample_vjp(sampled: Sample, shape: tuple[int, ...], v_values: Floats) -> tup
 
 
 class ShadowTape(NamedTuple):
-    """What :func:`shadows` keeps."""
+    """The values that :func:`shadows` keeps."""
 
     shadows: Floats  # [H, W] s
     is_shaded: Bools  # [H, W] whether h < h_s

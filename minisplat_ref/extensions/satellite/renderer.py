@@ -55,7 +55,7 @@ def sun_shift(camera: Camera) -> tuple[float, float]:
 
 
 def sheared(camera: AffineCamera, shift: tuple[float, float], margin: tuple[int, int]) -> AffineCamera:
-    """Return M A and M b, larger by a margin: what has altitude h moves by ``-g h``. The third row is ``-h``."""
+    """Return M A and M b, larger by a margin: a point of altitude h moves by ``-g h``. The third row is ``-h``."""
     A, b = (np.asarray(field, np.float64) for field in camera[:2])
     M = np.eye(3)
     M[:2, 2] = shift
@@ -68,7 +68,7 @@ def sheared(camera: AffineCamera, shift: tuple[float, float], margin: tuple[int,
 
 
 class Tape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     model: Model
     row: int  # of the shared parameters
@@ -181,8 +181,8 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Ta
 def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
     """Gradient of :func:`render`: light, then shadows, then the two splattings.
 
-    Altitudes have gradients from their channel, from the shadows as what is shaded and, in the sun's image, as what
-    shades. Both splattings add to the population and, through ``M A``, to the pose: ``v_A += M^T v_MA``.
+    Altitudes have gradients from their channel, from the shadows as receivers and, in the sun's image, as casters. Both
+    splattings add to the population and, through ``M A``, to the pose: ``v_A += M^T v_MA``.
     """
     where = channels(tape.wants)
     v = {name: np.ascontiguousarray(v_image[..., part]) for name, part in where.items()}

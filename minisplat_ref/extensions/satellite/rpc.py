@@ -5,7 +5,7 @@ ratios of cubics of them::
 
     line = (a . m(P, L, H)) / (b . m(P, L, H)) LINE_SCALE + LINE_OFF,   sample likewise by c and d
 
-m has 20 monomials, so a camera has 80 coefficients. They stand in a GeoTIFF's metadata, in a text ``_RPC.TXT`` or in an
+m has 20 monomials, so a camera has 80 coefficients. They are in a GeoTIFF's metadata, in a text ``_RPC.TXT`` or in an
 ``.RPB`` of the same numbers. Pixel (0, 0) of an RPC is the centre of the first pixel; here its centre is at 0.5.
 """
 
@@ -93,7 +93,7 @@ def localise(rpc: RPC, pixels: Floats, heights: Floats) -> Floats:
     wanted = (pixels - 0.5 - rpc.pixel_offset) / rpc.pixel_scale
     x = np.zeros((len(pixels), 3))
     x[:, 2] = (heights - rpc.ground_offset[2]) / rpc.ground_scale[2]
-    with np.errstate(all="ignore"):  # what does not converge is refused below
+    with np.errstate(all="ignore"):  # points that do not converge are refused below
         for _ in range(N_NEWTON):
             m, dm = _monomials(x)
             q = m @ rpc.denominators.T  # [N, 2]

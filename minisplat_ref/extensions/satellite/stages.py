@@ -4,8 +4,8 @@ Its kinks besides those of splatting: alpha at 0.05, where h passes h_s, the bor
 of the sun's image, and colours at 0. A difference across one of them is refused.
 
 Ties are no kinks. A pixel that a lone Gaussian covers, in the photograph and in the sun's image, has ``h = h_s`` and
-equal neighbours wherever the Gaussian moves; rounding decides which is larger, and every step would be refused. What is
-less than :data:`TIE` apart counts as equal.
+equal neighbours wherever the Gaussian moves; rounding decides which is larger, and every step would be refused. Values
+less than :data:`TIE` apart count as equal.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ TIE = 1e-12
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer with the sun: by an orthographic camera, in place of that without, and by an affine one.
+    """Return the renderer with the sun: by an orthographic camera, instead of that without, and by an affine one.
 
     The affine camera, as those of satellites, has depths of both signs.
     """

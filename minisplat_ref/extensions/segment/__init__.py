@@ -18,14 +18,14 @@ program may have made; nothing that was learned is downloaded.
 ``docs/FAMILY.md`` has the measured figures.
 
 It works for every recipe whose renderer blends the colours of its primitives once. Where the weights do not add up to
-the opacity of the image, the command says so; parameters that no PLY holds, such as networks that change opacities, are
-refused.
+the opacity of the image, the command reports it; parameters that no PLY holds, such as networks that change opacities,
+are refused.
 
-This deviates from the paper as follows. Masks of a view are drawn by the label of the largest weight, where the paper
-compares depths. --extract and --remove ask for one object against the rest, so that a Gaussian may belong to two; the
-labels of the PLY are a partition.
+This deviates from the paper as follows. Masks of a view show the label of the largest weight, where the paper compares
+depths. --extract and --remove separate one object from the rest, so that a Gaussian may belong to two; the labels of
+the PLY are a partition.
 
-Left out is what makes masks: there is no tracker and no network here.
+Left out is the making of masks: there is no tracker and no network here.
 """
 
 from minisplat_ref.extensions.extension import Extension

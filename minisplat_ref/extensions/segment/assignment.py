@@ -1,14 +1,14 @@
 """From votes to labels: the optimal assignment of FlashSplat (arXiv 2409.08270), with a bias to the background.
 
-With the geometry frozen, labels P_i in [0, 1] of the Gaussians draw the mask ``sum_i w_i P_i`` of [0, 1]. So
+With the geometry frozen, labels P_i in [0, 1] of the Gaussians render the mask ``sum_i w_i P_i`` in [0, 1]. So
 ``|sum_i w_i P_i - M|`` is that sum where M = 0 and 1 minus it where M = 1, and the mean over all pixels is linear in P:
 each Gaussian takes the class with more votes. Of two, with votes as shares,
 
     P_i = [a_1(i) > a_0(i) + gamma],   a_e(i) = A_e(i) / sum_f A_f(i)
 
-With gamma = 0 that is the optimum; a gamma above 0 leaves doubtful Gaussians to the background, which cleans what is
-taken out, and one below 0 takes them along, which cleans what remains. Of several objects, either each is asked for
-against the rest, and a Gaussian may belong to two; or each Gaussian has one label, that of most votes.
+With gamma = 0 that is the optimum; a gamma above 0 leaves doubtful Gaussians to the background, which cleans the
+extracted object, and one below 0 takes them along, which cleans the rest. Of several objects, either each is separated
+from the rest, and a Gaussian may belong to two; or each Gaussian has one label, that of most votes.
 """
 
 import numpy as np

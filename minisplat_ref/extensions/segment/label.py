@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Model or masks cannot be used, the bias is not in [-1, 1], or no mask has the object that is asked for.
+        Model or masks cannot be used, the bias is not in [-1, 1], or no mask has the requested object.
     """
     if not -1 <= args.bias <= 1:
         raise InputError(f"--bias is {args.bias:g}: give a number from -1 to 1")
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(votes: Votes, found: Any) -> str:
-    """Return a line for each label: how many Gaussians, and the share of their weight that lies in its pixels."""
+    """Return a line for each label: the number of Gaussians, and the share of their weight in its pixels."""
     rows = []
     for row, label in enumerate(votes.ids):
         is_own = found == label

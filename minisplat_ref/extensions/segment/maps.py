@@ -56,7 +56,7 @@ def _read_mask(path: Path, camera: Camera) -> Ints:
 def label_map(population: Any, labels: Ints, renderer: Renderer, camera: Camera) -> Ints:
     """Return the label [H, W] that each pixel shows: the one whose Gaussians have the largest weight together.
 
-    What the Gaussians of all labels but 0 leave of a pixel is the background's, with label 0.
+    The rest of a pixel, behind the Gaussians of all labels but 0, is the background's, with label 0.
     """
     found = np.unique(labels[labels > 0])
     sums = np.zeros((1 + len(found), camera.height, camera.width))

@@ -1,4 +1,4 @@
-"""The model that the commands work on: primitives, who draws them, cameras, and files with labels."""
+"""The model that the commands work on: primitives, their renderer, cameras, and files with labels."""
 
 from collections import namedtuple
 from pathlib import Path
@@ -28,7 +28,7 @@ class Subject(NamedTuple):
     file: Path
     """Its PLY."""
     label: Label
-    """What the file says about how it is drawn."""
+    """The label of the file."""
     population: Any
     """As the file holds it."""
     placed: Any
@@ -44,7 +44,7 @@ def read_subject(path: Path, cameras: Path | None = None) -> Subject:
     Raises
     ------
     InputError
-        There is no model or there are no cameras, or the renderer needs what no PLY holds.
+        There is no model or there are no cameras, or the renderer needs parameters that no PLY holds.
     """
     file = model_file(path)
     label = read_label(file)

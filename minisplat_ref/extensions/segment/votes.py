@@ -1,4 +1,4 @@
-"""What every Gaussian contributes to the pixels of each label: its votes.
+"""The votes of every Gaussian: its contribution to the pixels of each label.
 
 A view blends the colours c_i of its Gaussians to ``sum_i w_i(p) c_i`` at the pixel p. That is linear in the colours, so
 the weights of a Gaussian, summed over the pixels of a label e, are a gradient (FlashSplat, Eq. 7 counts the same):

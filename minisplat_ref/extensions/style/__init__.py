@@ -14,7 +14,7 @@ stripes, so its Gaussians are split first, and then painted.
 
    and four times the Gaussians whose colour has the largest gradients become four.
 
-The features F are those of a classical bank of filters, or of a network whose weights the user brings
+The features F are those of a classical bank of filters, or of a network with weights from the user
 (:mod:`minisplat_ref.mechanisms.features`).
 
     minisplat-ref style transfer RUN IMAGE --out NEW
@@ -26,8 +26,8 @@ The features F are those of a classical bank of filters, or of a network whose w
 This deviates from the paper as follows. Without VGG16 the features are edges, stripes and colours: patterns are copied,
 brush strokes are not understood; the content's weight is ours there. Children lie on a grid that keeps the parent's
 variance, not at random, because painting does not move them. The harmonics above the base colour are removed before
-painting, so that the paint is on the surface. The gradient of a colour is the root mean square that Adam keeps. How
-long the stages are, how many rounds there are and the rate of the colours are ours. Left out is CLIP's distance, whose
+painting, so that the paint is on the surface. The gradient of a colour is the root mean square that Adam keeps. The
+lengths of the stages, the number of rounds and the rate of the colours are ours. Left out is CLIP's distance, whose
 weights are not ours to ship.
 """
 

@@ -34,7 +34,7 @@ N_STYLE_ROWS = 2_000  # ours: of the style's features at each scale
 
 
 class Style(NamedTuple):
-    """What the losses need of the style image."""
+    """The features of the style image that the losses need."""
 
     bank: FeatureBank
     maps: tuple[Floats, ...]

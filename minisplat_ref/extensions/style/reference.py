@@ -20,9 +20,9 @@ class ColorMap(NamedTuple):
     M: Floats
     """[3, 3]."""
     source: Floats
-    """[3] mean of what is mapped."""
+    """[3] mean of the mapped colours."""
     target: Floats
-    """[3] mean of what it becomes."""
+    """[3] mean of the result."""
 
     def __call__(self, colors: Floats) -> Floats:
         """Return colours [..., 3] in [0, 1] as they become; they may leave [0, 1]."""
@@ -130,7 +130,7 @@ def feature_loss(
     Parameters
     ----------
     maps, content : sequence of ndarray of shape (h, w, C)
-        Features of the rendered image, and of the photograph that it is to show.
+        Features of the rendered image, and of the photograph that it should show.
     styles : sequence of ndarray of shape (Q, C)
         Units of the style's features, of :func:`unit_rows`.
     weights : FeatureWeights

@@ -1,6 +1,6 @@
 """A run read to be styled, and the run that comes of it: its files, without the application that wrote them.
 
-Extensions are below :mod:`minisplat_ref.app`, so this reads ``config.json`` itself. What it writes is an ordinary run
+Extensions are below :mod:`minisplat_ref.app`, so this reads ``config.json`` itself. The output is an ordinary run
 without a checkpoint, like that of ``simplify``: ``render``, ``eval``, ``info`` and ``convert`` take it.
 """
 
@@ -83,7 +83,7 @@ def open_run(folder: Path, scene: Path | None = None) -> OpenRun:
 
 
 def write_run(folder: Path, run: OpenRun, gaussians: Gaussians, about: Mapping[str, Any]) -> None:
-    """Write what makes a folder a run: configuration, Gaussians, cameras, and how many Gaussians there are.
+    """Write the files that make a folder a run: configuration, Gaussians, cameras, and the number of Gaussians.
 
     Parameters
     ----------

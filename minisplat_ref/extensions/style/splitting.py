@@ -1,9 +1,9 @@
-"""What makes room for patterns: large Gaussians are split, long ones shortened, and those that want two colours split.
+"""Splits that make room for patterns: of large Gaussians, long ones, and ones that are pulled to two colours.
 
 A Gaussian becomes a grid of children in the plane of its two longest axes. With two children per axis, each at a
 distance d from the middle and with the standard deviation s', the variance stays where ``d^2 + s'^2 = s^2``; in a row
-of four, at d and 3 d, where ``5 d^2 + s'^2 = s^2``. So the children leave no holes, and what they cover is what the
-parent covered. The shortest axis stays.
+of four, at d and 3 d, where ``5 d^2 + s'^2 = s^2``. So the children leave no holes, and cover the same area as the
+parent. The shortest axis stays.
 """
 
 import math
@@ -16,7 +16,7 @@ from minisplat_ref.strategy.ops import Edit, concat, n_rows, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 SHRINK = 1.6
-"""What a scale is divided by where two children share it, as in 3DGS; a row of four divides it by the square."""
+"""The divisor of a scale that two children share, as in 3DGS; a row of four divides it by the square."""
 GRIDS = {4: (2, 2), 8: (4, 2)}
 """Children along the longest and the second axis, by their number."""
 

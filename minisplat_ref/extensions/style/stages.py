@@ -64,7 +64,7 @@ def tiny_network(rng: np.random.Generator) -> FeatureBank:
 def feature_stage(bank: FeatureBank, image: Floats, moved: Part, name: str) -> Stage:
     """Return a bank's features as a stage, as a function of a part of the image.
 
-    What a ReLU passes is a threshold, and so is which of four pixels has the maximum.
+    The sign of a ReLU's input is a threshold, and so is which of four pixels has the maximum.
     """
 
     def function(part: Floats) -> Point:

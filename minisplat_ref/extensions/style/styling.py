@@ -31,7 +31,7 @@ N_PIXELS = 200_000  # of the photographs, from which their colours' mean and cov
 
 
 class Plan(NamedTuple):
-    """How to style."""
+    """Settings of the styling."""
 
     bank: FeatureBank = CLASSICAL
     weights: FeatureWeights = FeatureWeights(NNFM_AROUND, CONTENT_CLASSICAL)
@@ -43,7 +43,7 @@ class Plan(NamedTuple):
 
 
 class Styled(NamedTuple):
-    """What comes of it."""
+    """The result."""
 
     gaussians: Gaussians
     recolored: Gaussians
@@ -146,7 +146,7 @@ def recolor(gaussians: Gaussians, color_map: ColorMap) -> Gaussians:
 
 
 def _pixels(scene: Scene) -> Floats:
-    """Return colours [P, 3] in [0, 1], evenly from all photographs, without what masks leave out."""
+    """Return colours [P, 3] in [0, 1], evenly from all photographs, without masked pixels."""
     rows = [view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask] for view in scene.train_views]
     stride = max(1, sum(map(len, rows)) // N_PIXELS)
     return np.concatenate([row[::stride] for row in rows]) / 255

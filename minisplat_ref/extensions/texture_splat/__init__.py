@@ -7,10 +7,10 @@ Here it has T x T texels over four standard deviations to each side of its disc,
     X(u, v) = sum_ji h(y - j) h(x - i) X_ji,   x = (u / 4 + 1) (T - 1) / 2,   h(t) = max(0, 1 - |t|)
 
 X is a normal, from two numbers whose tanh is its tilt along the axes of the disc, with albedo, metallic share and
-roughness (:mod:`.reference`). What hits read is blended, and each pixel is shaded once, as in Ref-Gaussian. With T = 1
-this is Ref-Gaussian. Textures start as what each surfel of a finished run is everywhere; then centres and their number
-stay, and everything else is trained. With maps of normals and materials as targets, texels are also the solution of a
-linear least-squares problem (:mod:`.baking`).
+roughness (:mod:`.reference`). The texels that hits read are blended, and each pixel is shaded once, as in Ref-Gaussian.
+With T = 1 this is Ref-Gaussian. Textures start as the constant values of each surfel of a finished run; then centres
+and their number stay, and everything else is trained. With maps of normals and materials as targets, texels are also
+the solution of a linear least-squares problem (:mod:`.baking`).
 
     minisplat-ref train SCENE --recipe reflective --out runs/reflective
     minisplat-ref train SCENE --recipe texture-splat --init runs/reflective --set texels=4 --out runs/textured

@@ -1,15 +1,15 @@
 """Texels from maps: normals and materials of some views, baked into the textures of surfels that stay where they are.
 
-What is blended is linear in the texels X, so the best ones for targets m, weighed by the opacity A of pixels, are
+The blended values are linear in the texels X, so the best ones for targets m, weighed by the opacity A of pixels, are
 those of a linear least-squares problem::
 
     min over X of sum over pixels |sum_gt w_g h_gt X_gt - A m|^2
 
-with the weight w of a hit times the share h of a texel in what it reads. The first guess is the mean of the targets
-that a texel is read for, ``sum w h m / sum w h``. Accelerated projected gradients (Beck and Teboulle 2009) go on from
-there, among texels that can be stored: shares between 0 and 1, normals of unit length. The step of a texel is ``1 / sum
-w h``, which is short enough, as the w h of a pixel are positive and sum up to at most 1. Both products with the matrix
-are the blend and its gradient, so it is never stored.
+with the weight w of a hit times the share h of a texel in its value. The first guess is the mean of the targets
+that a texel is read for, ``sum w h m / sum w h``. Accelerated projected gradients (Beck and Teboulle 2009) continue
+from there, among texels that can be stored: shares between 0 and 1, normals of unit length. The step of a texel is ``1
+/ sum w h``, which is short enough, as the w h of a pixel are positive and sum up to at most 1. Both products with the
+matrix are the blend and its gradient, so it is never stored.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ READ_MIN = 1e-6  # sum of w h, in pixels, below which a texel is not seen
 
 
 class Maps(NamedTuple):
-    """What a view should show: the targets of baking."""
+    """The targets of baking in a view."""
 
     camera: Camera
     normals: Floats
@@ -140,7 +140,7 @@ def _normal_product(sights: Sequence[_Sight], texels: Floats) -> Floats:
 
 
 def _look(population: TexturedSurfels, maps: Maps, backend: Backend) -> _Sight:
-    """Return how a view reads the texels.
+    """Return the weights with which a view reads the texels.
 
     Raises
     ------

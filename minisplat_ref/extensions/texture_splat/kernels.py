@@ -51,7 +51,7 @@ class Sums(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """What was blended, and the derivative of the loss with respect to it."""
+    """The blended values, and the derivative of the loss with respect to them."""
 
     image: Floats  # [H * W, 8]
     v_image: Floats  # [H * W, 8]
@@ -131,7 +131,7 @@ def backward_kernel(response: KernelResponse) -> Callable:
 
     @scalar
     def read_vjp(buffer, v_texels, texels, n, size, v, lane):
-        """Add to the texels' gradients of a surfel; leave X . v, and the derivatives by (u, v), in the buffer."""
+        """Add to the texels' gradients of a surfel; leave X . v and its derivatives v_u and v_v in the buffer."""
         width, weight = int(size), buffer[lane]
         i0, i1, a0, a1, da0, da1 = neighbours(buffer[AT_U * WIDTH + lane], size)
         j0, j1, b0, b1, db0, db1 = neighbours(buffer[AT_V * WIDTH + lane], size)

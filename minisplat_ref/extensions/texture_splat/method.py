@@ -1,4 +1,4 @@
-"""The recipe of textures: what trains after a run of reflective surfels has ended."""
+"""The recipe of textures, which trains them after a run of reflective surfels has ended."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Surfels with textures: fields, how they start from surfels with one material, and textures of another size.
+"""Surfels with textures: fields, their start from surfels with one material, and textures of another size.
 
 A texture has T x T texels. A field holds those of all its channels in a row of numbers: the texel in row j, along the
 disc's second axis, and column i, along the first, has its channel c in column ``(j T + i) C + c``.
@@ -16,7 +16,7 @@ from minisplat_ref.mechanisms.gbuffer.population import first_light as first_lig
 from minisplat_ref.types import Floats, Gaussians, Scene
 
 CHANNELS = {"metallic_logits": 1, "roughness_logits": 1, "albedo_logits": 3, "normal_textures": 2}
-"""The textures, and how many channels each has."""
+"""The textures, and the number of channels of each."""
 
 
 class TexturedSurfels(NamedTuple):
@@ -61,7 +61,7 @@ def texels_of(population: Any) -> int:
 def with_textures(
     surfels: Gaussians | ReflectiveSurfels | TexturedSurfels, rng: np.random.Generator, *, texels: int
 ) -> TexturedSurfels:
-    """Return surfels with textures of ``texels`` x ``texels``, which show what the surfels had before.
+    """Return surfels with textures of ``texels`` x ``texels``, with the former materials of the surfels.
 
     Surfels with one material have it everywhere, and the normals of their discs; Gaussians first get the material of a
     new reflective surfel; textures of another size become larger or smaller.

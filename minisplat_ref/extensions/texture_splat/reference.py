@@ -1,4 +1,4 @@
-"""Textures on discs, in NumPy: where a hit reads them, the normals that they hold, and how they are blended.
+"""Textures on discs, in NumPy: the places that a hit reads, the normals that they hold, and their blending.
 
 A ray hits a disc at (u, v), in standard deviations (:mod:`minisplat_ref.mechanisms.surfels.response`). A texture of
 T x T texels covers |u|, |v| <= 4 with its outer texels on the border, and is read linearly between texels; those
@@ -101,7 +101,7 @@ def blend_texels_vjp(
         behind_g  = sum_{j behind g} w_j (X_j . v)
         v_alpha_g = T_g (X_g . v) - behind_g / (1 - alpha_g)
 
-    and from there to the surfels, as for colours; (u, v) adds to what moves a hit.
+    and from there to the surfels, as for colours; (u, v) adds to the gradient that moves a hit.
     """
     response, n = surfel_response(Layout()), len(texels)
     v_T, v_c, v_o = np.zeros((n, 3, 3)), np.zeros((n, 2)), np.zeros(n)
@@ -160,7 +160,7 @@ def raw_normals(tangent: Floats) -> Floats:
 
 
 def _read(tile: TileHits, texels: Floats) -> tuple[Floats, Corners]:
-    """Return what the hits of a tile read, [G, P, 8], and where."""
+    """Return the values that the hits of a tile read, [G, P, 8], and their places."""
     place: SurfelPlace = tile.hit.place
     # Misses may lie anywhere: they read the middle.
     u, v = (np.where(tile.alphas > 0, values, 0) for values in (place.u, place.v))

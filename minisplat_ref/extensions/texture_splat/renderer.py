@@ -1,6 +1,6 @@
-"""How textured surfels are drawn: textures are blended into the channels of normals and materials, then shaded.
+"""Rendering of textured surfels: textures are blended into the channels of normals and materials, then shaded.
 
-Shading, what hides the environment, and the light from around, which has one value for a whole surfel, are those of
+Shading, occlusion of the environment, and the light from around, which has one value for a whole surfel, are those of
 :mod:`minisplat_ref.mechanisms.gbuffer.renderer`. Textures of one texel are blended as materials are there.
 """
 
@@ -21,7 +21,7 @@ from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 
 class TextureTape(NamedTuple):
-    """What :func:`blend` keeps for :func:`blend_vjp`."""
+    """The values that :func:`blend` keeps for :func:`blend_vjp`."""
 
     discs: discs.BlendTape
     texels: Floats  # [N, T^2, 8]
@@ -29,7 +29,7 @@ class TextureTape(NamedTuple):
 
     @property
     def shown(self) -> Shown:
-        """What was blended."""
+        """The input of blending."""
         return self.discs.shown
 
 
@@ -157,7 +157,7 @@ def _module(request: Request) -> Any:
 
 
 def _parts(tape: discs.BlendTape) -> tuple[slice, slice]:
-    """Return the channels of normals and of materials in what surfels blend."""
+    """Return the channels of normals and of materials among those that surfels blend."""
     first = max(part.stop for part in tape.slices.values())
     return tape.slices["normal"], slice(first, first + N_CHANNELS - 3)
 

@@ -1,4 +1,4 @@
-"""The stage of the gradient check: textured surfels shaded with what hides the environment.
+"""The stage of the gradient check: textured surfels shaded with occlusion.
 
 Besides the kinks of shading, a hit has those between the cells of its textures, and a normal that of its largest tilt.
 """

@@ -44,7 +44,7 @@ def bounds(opacity_textures: Floats) -> Floats:
 class TexturedFootprints(Footprints):
     """The footprints of textured Gaussians.
 
-    The projection is that of the opacity o_B, compensated where the conventions ask for it.
+    The projection is that of the opacity o_B, compensated where the conventions require it.
     """
 
     logits: Floats

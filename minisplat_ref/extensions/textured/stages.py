@@ -16,7 +16,7 @@ NEAR_LIMB = 0.06  # of 1 - q . q, whose root has large higher derivatives, which
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer as a stage; the reference finds what is hit or clamped, and where a ray passes the limb."""
+    """Return the renderer as a stage; the reference finds hits, clamps, and the rays that pass the limb."""
     return (renderer_stage(backend, setting, TEXTURED_GAUSSIANS, _sides, rng),)
 
 

@@ -17,8 +17,8 @@ published modes, ``both_times`` and ``both_plus`` change opacity and colour (:mo
     python -m data_tools.claims vdgs/floats fox --downscale 2 --out DIR
     minisplat-ref oracle gradients --extension vdgs
 
-A run keeps the network in ``shared.npz``. A PLY does not hold it, and says so: drawn without the run, the Gaussians are
-those of 3DGS with y = 0. ``vdgs bake`` writes what one view sees.
+A run keeps the network in ``shared.npz``. A PLY does not hold it, and has a note of that: rendered without the run, the
+Gaussians are those of 3DGS with y = 0. ``vdgs bake`` writes the Gaussians of one view.
 
 This deviates from the paper as follows. The factor is 1 + y instead of y, and the last layer starts at 0, so that a
 training begins as 3DGS and without an output is 3DGS exactly. An opacity is kept between 1e-4 and 0.99; one above 0.99
@@ -38,7 +38,7 @@ from minisplat_ref.io.ply import save_ply
 
 
 def save(path: str | Path, gaussians: Any, label: Label) -> None:
-    """Write the six fields, and say in the header that the network is missing."""
+    """Write the six fields, with a note in the header that the network is missing."""
     save_ply(path, gaussians, label._replace(lacks=tuple(dict.fromkeys((*label.lacks, "network")))))
 
 

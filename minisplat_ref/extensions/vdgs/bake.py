@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref vdgs bake``, which writes the scene as one view sees it as a PLY for any viewer."""
+"""The command ``minisplat-ref vdgs bake``: the scene as one view sees it, as a PLY for any viewer."""
 
 import argparse
 from pathlib import Path

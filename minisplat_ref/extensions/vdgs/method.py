@@ -1,4 +1,4 @@
-"""The network, the renderer that asks it for every view, and the recipe.
+"""The network, the renderer that evaluates it for every view, and the recipe.
 
 With the centre mu of a Gaussian, the direction d from which it is seen, and the hash grid E::
 
@@ -57,13 +57,13 @@ class Tape(NamedTuple):
 
 
 def n_outputs(mode: Mode) -> int:
-    """Return how many outputs a network has: one for the opacity, one for each coefficient of colour."""
+    """Return the number of a network's outputs: one for the opacity, one for each coefficient of colour."""
     return mode.opacity + N_COLORS * mode.colors
 
 
 def initial_shared(scene: Scene, rng: np.random.Generator, *, modulation: Callable[[], Mode]) -> Mapping[str, Floats]:
-    """Return the network, whose last layer is 0, the hash grid, and the place of the scene, float32."""
-    (rng,) = rng.spawn(1)  # so that the training draws what one of 3DGS does
+    """Return the network, whose last layer is 0, the hash grid, and the bounds of the scene, float32."""
+    (rng,) = rng.spawn(1)  # so that the training draws the random numbers of one of 3DGS
     levels = make_levels(N_LEVELS, COARSEST, FINEST, n_rows=N_ROWS, n_features=N_FEATURES)
     network = make_network((3 + N_LEVELS * N_FEATURES, HIDDEN, n_outputs(modulation())), rng)
     last = Layer(*(np.zeros_like(array) for array in network[-1]))

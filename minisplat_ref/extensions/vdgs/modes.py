@@ -1,10 +1,10 @@
-"""The modes, what the network changes and how, as functions: ``--set modulation=NAME`` chooses one."""
+"""The modes of the network's effect, as functions: ``--set modulation=NAME`` chooses one."""
 
 from typing import NamedTuple
 
 
 class Mode(NamedTuple):
-    """What the outputs of the network are for."""
+    """The use of the network's outputs."""
 
     opacity: bool
     """The first output changes the opacity."""

@@ -1,6 +1,7 @@
-"""What a network's output does to opacities and coefficients, each beside its gradient.
+"""The effect of a network's output on opacities and coefficients, each beside its gradient.
 
-All of it is in NumPy alone: a few operations per Gaussian, beside a network and a hash grid that have kernels.
+All of it is in NumPy alone: a few operations per Gaussian are negligible compared with the network and the hash grid,
+which have kernels.
 """
 
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 
 from minisplat_ref.types import Bools, Floats
 
-OPACITY_MAX = 0.99  # of what the network raises
+OPACITY_MAX = 0.99  # for opacities that the network raises
 OPACITY_MIN = 1e-4  # below 1/255, which no pixel shows
 
 
@@ -24,7 +25,7 @@ def modulate_vjp(x: Floats, y: Floats, is_sum: bool, v: Floats) -> tuple[Floats,
 
 
 class Opacities(NamedTuple):
-    """Opacities of a view, and what their gradient needs."""
+    """Opacities of a view, and the values that their gradient needs."""
 
     logits: Floats
     """[N] l' = logit(o')."""

@@ -1,4 +1,4 @@
-"""What the gradient check looks at: the renderer in four modes, with a small network and a small table.
+"""Stages for the gradient check: the renderer in four modes, with a small network and a small table.
 
 ReLUs, the faces of the grid's cells and the bounds of opacity are kinks, whose sides are part of a point. The two
 modes that are not here are parts of those that change both.

@@ -1,4 +1,4 @@
-"""The population with velocities, how it is drawn, and the recipe that trains it."""
+"""The population with velocities, its renderer, and the recipe that trains it."""
 
 from typing import Any, NamedTuple
 

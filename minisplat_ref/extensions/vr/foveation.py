@@ -5,11 +5,11 @@ et al. 2012)::
 
     MAR(e) = w + m e,   w = 1/48 degree, m = 0.0275
 
-The pixel of the display counts as what the eye resolves at the eccentricity ``full``; up to there every pixel is drawn.
-Where MAR has doubled, one ray for each block of 2 x 2 pixels is enough, and where it has doubled again, one for 4 x 4.
-These coarse images are drawn through the centres of the blocks with the same footprints, low-pass included, and only
-in the tiles that need them. They are interpolated between the centres, and blended with the finer image in a ring
-where a zone begins.
+The pixel of the display is taken as the resolution of the eye at the eccentricity ``full``; up to there every pixel is
+rendered. Where MAR has doubled, one ray for each block of 2 x 2 pixels is enough, and where it has doubled again, one
+for 4 x 4. These coarse images are rendered through the centres of the blocks with the same footprints, low-pass
+included, and only in the tiles that need them. They are interpolated between the centres, and blended with the finer
+image in a ring where a zone begins.
 
 A footprint on its tangent plane does not depend on the pixels, so each Gaussian is projected and shaded once for all
 zones, and one sort of the keys (zone, tile, distance) makes their lists. A tile has as many rays in every zone, so one
@@ -41,7 +41,7 @@ class Gaze(NamedTuple):
     y: float
     """Pixels."""
     full: float
-    """Eccentricity up to which every pixel is drawn, degrees."""
+    """Eccentricity up to which every pixel is rendered, degrees."""
 
 
 class Sampling(NamedTuple):
@@ -58,14 +58,14 @@ class Sampling(NamedTuple):
 
 
 class Zone(NamedTuple):
-    """The work of drawing at one rate."""
+    """The work of rendering at one rate."""
 
     block: int
     """Pixels per side of the block of one ray."""
     begins: float
     """Eccentricity at which the zone begins, degrees."""
     n_tiles: int
-    """Number of tiles that were drawn."""
+    """Number of tiles that were rendered."""
     n_samples: int
     """Number of their rays."""
     n_pairs: int
@@ -96,12 +96,12 @@ def eccentricities(camera: Camera, x: float, y: float) -> Floats:
 def zone_weights(eccentricities: Floats, full: float) -> list[Floats]:
     """Return the weight [H, W] of each zone's image; the weights add up to one.
 
-    A ring lies in the coarser zone, so that no pixel is drawn more coarsely than its eccentricity allows.
+    A ring lies in the coarser zone, so that no pixel is rendered more coarsely than its eccentricity allows.
     """
     weights, rest = [], np.ones_like(eccentricities)
     for begins in zone_begins(full)[1:]:
         t = np.clip((eccentricities - begins) / max(RING * begins, 1e-9), 0, 1)
-        share = t * t * (3 - 2 * t)  # of what is coarser
+        share = t * t * (3 - 2 * t)  # of coarser pixels
         weights.append(rest * (1 - share))
         rest = rest * share
     return [*weights, rest]
@@ -136,7 +136,7 @@ def render_foveated(
     camera : Camera
         The camera of the whole image.
     request : Request
-        It asks for colours only.
+        Of colours only.
     gaze : Gaze
         Where the eye looks.
     buffer_size : int, optional
@@ -159,7 +159,7 @@ def render_foveated(
     weights, begins = zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full), zone_begins(gaze.full)
     tile = request.backend.tile_width, request.backend.tile_height
     samplings = [_sample(camera, weight > 0, 2**k, tile) for k, weight in enumerate(weights)]
-    # The coarsest blocks may extend beyond the image, and so may what is projected.
+    # The coarsest blocks may extend beyond the image, and so may the projected footprints.
     coarsest = samplings[-1]
     width, height = coarsest.block * coarsest.camera.width, coarsest.block * coarsest.camera.height
     all_blocks = camera._replace(width=width, height=height)
@@ -179,7 +179,7 @@ def render_foveated(
 def bin_zones(footprints: TangentFootprints, samplings: Sequence[Sampling]) -> list[TileBins]:
     """List the Gaussians of every tile that is needed, of all zones with one sort; the other tiles' lists are empty.
 
-    The lists suffice for drawing, not for differentiating.
+    The lists suffice for rendering, not for differentiating.
     """
     offsets = np.cumsum([0, *(len(sampling.is_needed) for sampling in samplings)])  # of a zone's tiles among all
     pairs = [_pairs_of(footprints.boxes, sampling) for sampling in samplings]
@@ -224,7 +224,7 @@ def _in_blocks(boxes: Ints, sampling: Sampling) -> Ints:
 
 
 def _draw(prepared: Prepared, sampling: Sampling, bins: TileBins) -> Floats:
-    """Return the image [H, W, 3] of a zone; what is not listed there is not even looked at."""
+    """Return the image [H, W, 3] of a zone; Gaussians that are not listed there are not even read."""
     rows = np.unique(bins.gaussian_ids)
     fields = {name: field[rows] for name, field in prepared.footprints._asdict().items() if name != "camera"}
     fields["boxes"] = _in_blocks(fields["boxes"], sampling)
@@ -274,7 +274,7 @@ def _find_needed_tiles(is_needed: Bools, grid: TileGrid) -> Bools:
 
 
 def _n_pixels(tiles: Bools, grid: TileGrid) -> int:
-    """Return how many pixels of the image lie in tiles."""
+    """Return the number of the image's pixels that lie in tiles."""
     total = 0
     for tile in np.flatnonzero(tiles):
         y, x = divmod(int(tile), grid.n_tiles_x)

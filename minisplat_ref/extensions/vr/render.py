@@ -1,10 +1,10 @@
-"""The command ``minisplat-ref vr render``, which draws images for an eye that looks at a given pixel."""
+"""The command ``minisplat-ref vr render``: images for an eye that looks at a given pixel."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-FULL = 8.0  # degrees in which every pixel is drawn
+FULL = 8.0  # degrees in which every pixel is rendered
 
 
 def add_parser(commands: Any) -> None:

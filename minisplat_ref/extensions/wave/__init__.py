@@ -23,10 +23,10 @@ method as a baseline. A display that shows phases alone gets the double-phase en
 
 ``docs/FAMILY.md`` has the measured figures.
 
-Any run will do: surfels are flat; other Gaussians lose their thinnest axis, and how many were no discs is said. What
-the camera sees is placed in a box of the display's size without perspective, as behind an eyepiece
-(:mod:`minisplat_ref.extensions.wave.placement`). An amplitude is what an image stores, and its square the intensity,
-close to what a screen does. So with everything in focus the absolute values of the field are the rendered image.
+Any run will do: surfels are flat; other Gaussians lose their thinnest axis, and the number of those that were no discs
+is reported. The camera's view is placed in a box of the display's size without perspective, as behind an eyepiece
+(:mod:`minisplat_ref.extensions.wave.placement`). Images store amplitudes, whose squares are intensities, much as on a
+screen. So with everything in focus the absolute values of the field are the rendered image.
 
 This deviates from the paper as follows. Exact blending of a whole scene is done in windows and 64 planes
 (:mod:`minisplat_ref.extensions.wave.windows`); without them it takes two transforms of the grid for each Gaussian. The
@@ -34,7 +34,7 @@ fast approximation has one transmittance for each Gaussian, at its centre, inste
 a Gaussian that is steeper than its own light would shine along its mirrored direction as well. The low-pass is that of
 3DGS, for surfels too.
 
-Left out: training on holograms, random phases (they blur what is out of focus more, with speckle), and the paper's
+Left out: training on holograms, random phases (they blur parts out of focus more, with speckle), and the paper's
 comparison by photographs of a display. There is nothing to train, so the gradients are those of the closed form.
 """
 

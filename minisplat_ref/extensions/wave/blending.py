@@ -1,11 +1,11 @@
-"""Alpha blending of waves, and what it is compared with: three ways to a hologram, each Gaussian on the whole grid.
+"""Alpha blending of waves, and its alternatives: three ways to a hologram, each Gaussian on the whole grid.
 
-*Exact* blending goes front to back like 3DGS, with waves in the place of colours. u is the field of a Gaussian in the
+*Exact* blending goes front to back like 3DGS, with waves instead of colours. u is the field of a Gaussian in the
 plane of its own centre, with its peak at 1; o its opacity, c its amplitude; P propagates to the hologram:
 
     U = sum_i P[T_i o_i c_i u_i],   T_(i+1) = T_i (1 - o_i |u_i|)
 
-T is a mask: it hides what is straight behind, and does not diffract. *Fast* blending takes for T one number per
+T is a mask: it hides everything straight behind, and does not diffract. *Fast* blending takes for T one number per
 Gaussian, the transmittance at its centre, so that everything is one sum of closed forms over Gaussians:
 
     U = sum_i t_i o_i c_i G_i,   t_i = prod_(j before i) (1 - o_j exp(-d^T C_j^-1 d / 2)),   d = (c_i - c_j)_xy
@@ -34,7 +34,7 @@ class Scene(NamedTuple):
     opacities: Floats
     """[N]."""
     amplitudes: Floats
-    """[N, 3] of red, green and blue light: what an image stores, whose square is the intensity."""
+    """[N, 3] of red, green and blue light, as images store it; its square is the intensity."""
 
 
 def front_to_back(scene: Scene) -> Scene:
@@ -82,7 +82,7 @@ def blend_fast(scene: Scene, grid: Grid, wavelength: float, channel: int) -> Com
 
 
 def center_transmittances(scene: Scene) -> Floats:
-    """Return t [N], what those in front leave at the centre of each Gaussian."""
+    """Return t [N], the transmittance in front of the centre of each Gaussian."""
     centers, precisions = scene.flats.centers[:, :2], np.linalg.inv(scene.flats.lateral_covariances)
     t = np.ones(len(centers))
     for j in range(len(centers)):  # on all that are behind

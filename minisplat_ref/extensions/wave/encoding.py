@@ -22,7 +22,7 @@ BLACK = 1 / 255  # of the largest amplitude
 
 
 def encode(field: Complexes) -> tuple[Floats, float]:
-    """Return the phases [H, W] in [0, 2 pi) of a field, and the amplitude that 1 stands for."""
+    """Return the phases [H, W] in [0, 2 pi) of a field, and the amplitude that 1 represents."""
     peak = float(np.abs(field).max()) or 1.0
     amplitudes = np.minimum(np.abs(field) / peak, 1)
     half = np.arccos(amplitudes)

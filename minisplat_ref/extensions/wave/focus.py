@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref wave focus``: what an eye or a camera sees of a hologram that is focused on a depth."""
+"""The command ``minisplat-ref wave focus``: the view of a hologram by an eye or a camera focused on a depth."""
 
 import argparse
 from pathlib import Path

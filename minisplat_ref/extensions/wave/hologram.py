@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref wave hologram``: what a camera sees of a model, as the light that a display sends out."""
+"""The command ``minisplat-ref wave hologram``: a camera's view of a model, as the light that a display sends out."""
 
 import argparse
 import math

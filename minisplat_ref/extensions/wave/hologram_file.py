@@ -1,4 +1,4 @@
-"""A hologram as an .npz: one complex field for each colour, and what is needed to look at it."""
+"""A hologram as an .npz: one complex field for each colour, and the data for viewing it."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ NAMES = ("real", "imaginary", "wavelengths", "pitch", "depths", "thickness")
 
 
 class Hologram(NamedTuple):
-    """What a display shows."""
+    """The content of a display."""
 
     fields: Complexes
     """[3, H, W] of red, green and blue light in the plane z = 0; an image's values are their absolute values."""
@@ -26,7 +26,7 @@ class Hologram(NamedTuple):
     pitch: float
     """Metres."""
     depths: Floats
-    """[2] of the camera, world units: what is at z = D / 2 and at -D / 2."""
+    """[2] of the camera, world units, that lie at z = D / 2 and at -D / 2."""
     thickness: float
     """D, metres."""
 

@@ -1,7 +1,7 @@
 """The sum over Gaussians at every frequency, for fast blending: the closed form once more, by scalars.
 
-Each frequency has one writer, which takes the Gaussians in their order. What is below exp(-CUTOFF) of a Gaussian's peak
-is left out before the phase is computed; that is most, as the frequencies of a large Gaussian are few.
+Each frequency has one writer, which takes the Gaussians in their order. Values below exp(-CUTOFF) of a Gaussian's peak
+are left out before the phase is computed; that is most, as the frequencies of a large Gaussian are few.
 """
 
 import math

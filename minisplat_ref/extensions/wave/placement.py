@@ -1,9 +1,8 @@
 """From a model and a camera to flat Gaussians before a hologram.
 
-A camera sees tens of degrees, a hologram with pixels of 8 um only two. So the scene is placed as a display does it
-whose eyepiece makes the angle: what the camera sees becomes a box of the size of the hologram, without perspective,
-whose depth is linear in 1 / Z. That map takes planes to planes. With rho metres for a pixel of the camera and Z the
-camera's depth
+A camera sees tens of degrees, a hologram with pixels of 8 um only two. So the scene is placed as in a display whose
+eyepiece makes the angle: the camera's view becomes a box of the size of the hologram, without perspective, whose depth
+is linear in 1 / Z. That map takes planes to planes. With rho metres for a pixel of the camera and Z the camera's depth
 
     x = rho (fx X / Z + cx - w / 2),   y likewise,   z = D (1 / Z - (a + b) / 2) / (a - b)
 
@@ -35,11 +34,11 @@ from minisplat_ref.rendering import activate
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
 
 THICK = 0.5  # ratio of the least to the middle scale above which a Gaussian is no disc
-DEPTH_SHARE = 0.01  # of what is in view, by opacity and area, that is nearer or farther than the box, each
+DEPTH_SHARE = 0.01  # of the scene in view, by opacity and area, that is nearer or farther than the box, each
 
 
 class Box(NamedTuple):
-    """Where a hologram has what a camera sees."""
+    """The placement of a camera's view in a hologram."""
 
     camera: Camera
     nearest: float
@@ -63,7 +62,7 @@ class Box(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A scene in its box, with counts of what could not be kept."""
+    """A scene in its box, with counts of the Gaussians that could not be kept."""
 
     scene: Scene
     box: Box
@@ -76,7 +75,7 @@ class Placed(NamedTuple):
 def place(
     gaussians: Gaussians, camera: Camera, width: float, thickness: float, steepest: float, conventions: Conventions
 ) -> Placed:
-    """Return what a camera sees of a model, in a box around a hologram.
+    """Return a camera's view of a model, in a box around a hologram.
 
     Parameters
     ----------
@@ -144,7 +143,7 @@ def _ends(depths: Floats, weights: Floats) -> tuple[float, float]:
 
 
 def _flats_in(box: Box, seen: Gaussians, in_camera: Floats, steepest: float, eps2d: float) -> tuple[Flats, int]:
-    """Return flat Gaussians in the box, and how many were too steep."""
+    """Return flat Gaussians in the box, and the number of those that were too steep."""
     camera, (X, Y, Z) = box.camera, in_camera.T
     z = np.clip(box.z_of(Z), -box.thickness / 2, box.thickness / 2)
     x = box.rho * (camera.fx * X / Z + camera.cx - camera.width / 2)

@@ -14,7 +14,7 @@ the axes. The field that it sends to the plane z has the spectrum
         exp(i 2 pi (cz / lambda - fx cx - fy cy + fz (z - cz)))
 
 The peak is at fx = fy = 0 however the Gaussian is tilted, because the wave that lights it travels along z: a tilt makes
-the spectrum wider, not oblique. What is sampled is in :mod:`.sampling`.
+the spectrum wider, not oblique. Sampling is in :mod:`.sampling`.
 """
 
 from typing import NamedTuple
@@ -166,7 +166,7 @@ def rayleigh_sommerfeld(flats: Flats, places: Floats, wavelength: float, n: int 
         U = sum exp(-(a^2 / s_1^2 + b^2 / s_2^2) / 2 + i 2 pi z / lambda) |n . r| / r^2 (1 / r - i 2 pi / lambda)
             exp(i 2 pi r / lambda) / (2 pi) da db
 
-    It shares nothing with the closed form but the field on the plane, and is what a point cloud costs.
+    It shares nothing with the closed form but the field on the plane, and has the cost of a point cloud.
 
     Parameters
     ----------

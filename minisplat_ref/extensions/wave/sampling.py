@@ -1,4 +1,4 @@
-"""Fields on a grid of pixels: their waves, what propagates them, and when the pixels are too coarse or too fine.
+"""Fields on a grid of pixels: their waves, their propagation, and limits of the pixels' size.
 
 A hologram of w x h pixels of the pitch p is computed on twice as many, so that light which leaves it at one side does
 not come back at the other. The angular spectrum method multiplies the spectrum by the transfer function

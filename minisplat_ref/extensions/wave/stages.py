@@ -1,4 +1,4 @@
-"""What the gradient check covers: the closed form, with respect to everything that makes it. Nothing is trained."""
+"""Stages for the gradient check: the closed form, with respect to all its inputs. Nothing is trained."""
 
 import numpy as np
 

@@ -5,7 +5,7 @@ centre a Gaussian is small. So here its spectrum is evaluated on the few frequen
 propagated to the nearest of ``N_PLANES`` planes, which the window's margin leaves room for. The transmittance T is one
 array for all. Each plane is propagated to the hologram by the angular spectrum method, once.
 
-What is left out is the ringing of Gaussians about as narrow as a pixel, whose spectrum the pitch cuts off, beyond their
+Left out is the ringing of Gaussians about as narrow as a pixel, whose spectrum the pitch cuts off, beyond their
 windows: less than a fiftieth for a standard deviation of 0.55 pixels, the least that the low-pass leaves, and less than
 a thousandth from 1 pixel on.
 
@@ -26,7 +26,7 @@ from minisplat_ref.types import Floats, Ints
 
 N_PLANES = 64
 REACH = 4.5  # standard deviations from the centre of a window to its side: exp(-REACH^2 / 2) = 4e-5
-MARGIN = 4  # pixels besides, for what diffraction spreads on the way to the nearest plane
+MARGIN = 4  # pixels besides, for the spread by diffraction on the way to the nearest plane
 
 
 class Window(NamedTuple):
@@ -46,7 +46,7 @@ class Window(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """Where Gaussians are blended."""
+    """The windows in which Gaussians are blended."""
 
     z: Floats
     """[L] from front to back, metres."""
@@ -124,7 +124,7 @@ def blend_silhouette_windows(
 def _blend_plane(
     scene: Scene, planes: Planes, plane: int, grid: Grid, wavelength: float, channel: int, T: Floats
 ) -> Complexes | None:
-    """Return the light [H, W] of the Gaussians of a plane, None without any; T is multiplied by what they let pass."""
+    """Return the light [H, W] of the Gaussians of a plane, None without any; T is multiplied by their transmittance."""
     first, end = np.searchsorted(planes.of, [plane, plane + 1])
     if first == end:
         return None

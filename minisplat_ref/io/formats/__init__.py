@@ -1,13 +1,13 @@
 """Compact file formats of Gaussians: a suffix, levels of precision, and a pair of functions.
 
-A PLY stores every float. A format stores less, at one of several levels, and says how much may be lost. Those of other
-programs are here, :mod:`.catalogue`: ``.spz`` (:mod:`.spz`), Niantic's, versions 2 to 4; ``.splat`` (:mod:`.splat`), of
-the first viewers in the browser; ``.sog`` (:mod:`.sog`) and ``.compressed.ply`` (:mod:`.compressed_ply`), of SuperSplat
-and PlayCanvas; ``.glb`` (:mod:`.glb`), glTF with its extension for Gaussians; and ``.ksplat`` (:mod:`.ksplat`), only
-read. An extension may bring further ones. ``minisplat_ref.extensions.extension.find_format`` finds all by the
-suffix of a file.
+A PLY stores every float. A format stores less, at one of several levels, and describes the possible loss. Those of
+other programs are here, :mod:`.catalogue`: ``.spz`` (:mod:`.spz`), Niantic's, versions 2 to 4; ``.splat``
+(:mod:`.splat`), of the first viewers in the browser; ``.sog`` (:mod:`.sog`) and ``.compressed.ply``
+(:mod:`.compressed_ply`), of SuperSplat and PlayCanvas; ``.glb`` (:mod:`.glb`), glTF with its extension for Gaussians;
+and ``.ksplat`` (:mod:`.ksplat`), only read. An extension may bring further ones.
+``minisplat_ref.extensions.extension.find_format`` finds all by the suffix of a file.
 
-They hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that draws these six in its own
+They hold the six fields of 3DGS; the fields of an extension need a PLY. An extension that renders these six in another
 way is recorded in a file beside theirs (:mod:`minisplat_ref.io.label`).
 """
 
@@ -32,7 +32,7 @@ class Format(NamedTuple):
     suffix: str
     """The end of the names of such files, including the dot."""
     summary: str
-    """What it is, in half a line."""
+    """A description of half a line."""
     levels: tuple[str, ...]
     """Description of each level of precision; the finest, and usually largest, first."""
     default_level: int
@@ -42,12 +42,12 @@ class Format(NamedTuple):
     decode: Callable[[bytes, str | Path], Gaussians]
     """``decode(content, source)`` of a whole file; float32, finite. Raises InputError, which names ``source``."""
     describe: Callable[[bytes, str | Path], list[tuple[str, str]]]
-    """``describe(content, source)``: names and values that say what the file stores, and how precisely."""
+    """``describe(content, source)``: the content of the file and its precision, as names and values."""
     write_label: Callable[[bytes, Label], bytes] | None = None
     """``write_label(content, label)``: the content with a label in it; None where there is no place for one, so that it
     goes into a sidecar."""
     read_label: Callable[[bytes, str | Path], Label] | None = None
-    """``read_label(content, source)``: what ``write_label`` wrote, ``NO_LABEL`` where it did not. Raises InputError."""
+    """``read_label(content, source)``: the label of ``write_label``, ``NO_LABEL`` without one. Raises InputError."""
 
 
 def read_content(path: str | Path) -> bytes:
@@ -82,7 +82,7 @@ def with_label(format_: Format, content: bytes, label: Label) -> bytes:
 
 
 def write_file(path: Path, format_: Format, content: bytes, label: Label) -> None:
-    """Write a compact file whose content has its label if it can, and else the label beside it.
+    """Write a compact file with its label in the content if the format has a place for it, and else beside it.
 
     Raises
     ------

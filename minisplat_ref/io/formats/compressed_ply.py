@@ -7,7 +7,7 @@ words of 32 bits:
 ========= ==============================================================================================
 position  11, 10 and 11 bits for x, y, z, x highest, between the bounds
 scale     the same of log-scales, of which the bounds are clipped to [-20, 20]
-rotation  2 bits say which of w, x, y, z is largest, and of the others each has 10 bits: ``q / sqrt(2) + 1/2``
+rotation  2 bits for which of w, x, y, z is largest, 10 bits for each of the others: ``q / sqrt(2) + 1/2``
 color     8 bits each for red, green, blue (``0.5 + SH_C0 c``, between the bounds) and opacity
 ========= ==============================================================================================
 
@@ -194,7 +194,7 @@ def _parse(content: bytes, source: str | Path) -> _Parts:
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return how precise a file is, as pairs of name and text.
+    """Return the precision of a file, as pairs of name and text.
 
     Raises
     ------
@@ -222,4 +222,4 @@ COMPRESSED_PLY = Format(
     decode=decode,
     describe=describe,
 )
-"""What SuperSplat and PlayCanvas read."""
+"""The format of SuperSplat and PlayCanvas."""

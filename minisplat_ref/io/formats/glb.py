@@ -126,7 +126,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     Raises
     ------
     InputError
-        The file is damaged, has no Gaussians, or has what is left out.
+        The file is damaged, has no Gaussians, or uses a feature that is left out.
     """
     file = _parse(content, source)
     if not file.attributes:
@@ -228,7 +228,7 @@ def _parse(content: bytes, source: str | Path) -> _File:
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return what a file is, as pairs of name and text.
+    """Return a description of a file, as pairs of name and text.
 
     Raises
     ------
@@ -248,4 +248,4 @@ GLB = Format(
     decode=decode,
     describe=describe,
 )
-"""What Khronos has ratified."""
+"""The format that Khronos has ratified."""

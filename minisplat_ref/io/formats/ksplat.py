@@ -1,7 +1,7 @@
 """``.ksplat``: the format of mkkellogg's GaussianSplats3D, version 0.1, which is read and not written.
 
 A header of 4,096 bytes, headers of 1,024 bytes for sections, and then each section: the sizes of its partly filled
-buckets, the centres of its buckets, and its Gaussians. Three compression levels differ in what a Gaussian has:
+buckets, the centres of its buckets, and its Gaussians. Three compression levels differ in the data of a Gaussian:
 
 =========== ============ ==================================== =====================
 level       0            1                                    2
@@ -14,8 +14,8 @@ harmonics   float32      float16                              uint8 between two 
 =========== ============ ==================================== =====================
 
 Harmonics are stored degree by degree, of each first all red ones. A centre is ``(u - r) b / (2 r)`` from that of its
-bucket, of edge length b, with r = 32767 unless the section says otherwise. Sections of different degrees are filled up
-with zeros. A scale of 0 is read as e^-10, as splat-transform does. The frame is that of the PLY.
+bucket, of edge length b, with r = 32767 unless the section has another value. Sections of different degrees are filled
+up with zeros. A scale of 0 is read as e^-10, as splat-transform does. The frame is that of the PLY.
 """
 
 import struct
@@ -195,4 +195,4 @@ KSPLAT = Format(
     decode=decode,
     describe=describe,
 )
-"""What GaussianSplats3D reads and writes."""
+"""The format of GaussianSplats3D."""

@@ -1,4 +1,4 @@
-"""What the formats of other programs share: bytes of opacity and colour, and quaternions without their largest part."""
+"""Encodings of several formats: bytes of opacity and colour, and quaternions without their largest component."""
 
 import math
 from pathlib import Path
@@ -42,7 +42,7 @@ def sh_dc_of(levels: NDArray[np.uint8]) -> Floats:
 
 
 def without_largest(quats: Floats) -> tuple[Ints, Floats]:
-    """Return which component of w, x, y, z is the largest [N], and the others [N, 3] in [0, 1].
+    """Return the index of the largest of w, x, y, z [N], and the other components [N, 3] in [0, 1].
 
     Of unit quaternions with a positive largest component no other is beyond ``1 / sqrt(2)``; u = q / sqrt(2) + 1/2.
     """
@@ -53,7 +53,7 @@ def without_largest(quats: Floats) -> tuple[Ints, Floats]:
 
 
 def with_largest(largest: Ints, others: Floats) -> Floats:
-    """Return unit quaternions [N, 4], wxyz, of what :func:`without_largest` returns."""
+    """Return unit quaternions [N, 4], wxyz, from the output of :func:`without_largest`."""
     others = math.sqrt(2.0) * (others - 0.5)
     quats = np.empty((len(others), 4))
     np.put_along_axis(quats, OTHERS[largest], others, axis=1)
@@ -77,7 +77,7 @@ def finish(source: str | Path, gaussians: Gaussians) -> Gaussians:
 
 
 def check_float32(gaussians: Gaussians) -> None:
-    """Refuse what no file of float32 holds.
+    """Refuse values that no file of float32 holds.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def scales_of(gaussians: Gaussians) -> NDArray[np.float32]:
 
 
 def refuse_size(source: str | Path, needed: int, found: int) -> None:
-    """Refuse a file that is shorter than it says.
+    """Refuse a file that is shorter than its header states.
 
     Raises
     ------

@@ -151,7 +151,7 @@ def _codebook(values: Floats) -> tuple[list[float], NDArray[np.uint8]]:
 
 
 def _palette(rows: Floats) -> tuple[Floats, Ints]:
-    """Return at most 65,536 rows [M, D] that stand for rows [N, D], and which one stands for each."""
+    """Return at most 65,536 rows [M, D] that represent rows [N, D], and the index of the one for each."""
     n, n_columns = rows.shape
     if n <= PALETTE_MAX:
         return rows, np.arange(n)
@@ -266,7 +266,7 @@ def _parse(content: bytes, source: str | Path) -> _File:
                     images[name] = _pixels(archive.read(file), name, meta, len(content))
     except InputError:
         raise
-    except Exception as error:  # what zipfile, json and Pillow raise for damaged bytes is a dozen types
+    except Exception as error:  # zipfile, json and Pillow raise a dozen types of errors for damaged bytes
         raise InputError(f"{source}: not a SOG file, or damaged ({error or type(error).__name__}); {WAY_OUT}") from None
     return _File(meta, meta["count"], images)
 
@@ -287,7 +287,7 @@ def _check_meta(meta: Any, source: str | Path) -> None:
 
 
 def _pixels(data: bytes, name: str, meta: Mapping[str, Any], n_bytes: int) -> NDArray[np.uint8]:
-    """Return an image's pixels after a look at its size: [P, 4], or [H, W, 4] of the palette."""
+    """Return an image's pixels after a check of its size: [P, 4], or [H, W, 4] of the palette."""
     with Image.open(BytesIO(data), formats=("WEBP", "PNG")) as image:
         width, height = image.size
         if 4 * width * height > min(RATIO_MAX * n_bytes, memory.free_bytes()):
@@ -299,7 +299,7 @@ def _pixels(data: bytes, name: str, meta: Mapping[str, Any], n_bytes: int) -> ND
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return how precise a file is, as pairs of name and text.
+    """Return the precision of a file, as pairs of name and text.
 
     Raises
     ------
@@ -329,4 +329,4 @@ SOG = Format(
     decode=decode,
     describe=describe,
 )
-"""What SuperSplat publishes."""
+"""The format that SuperSplat publishes."""

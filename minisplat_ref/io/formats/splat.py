@@ -82,7 +82,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return how precise a file is, as pairs of name and text."""
+    """Return the precision of a file, as pairs of name and text."""
     return [
         ("centres, scales", "float32"),
         ("rotations", f"each component within {0.5 / 128:.2g}"),
@@ -99,4 +99,4 @@ SPLAT = Format(
     decode=decode,
     describe=describe,
 )
-"""What the first viewers in the browser read."""
+"""The format of the first viewers in the browser."""

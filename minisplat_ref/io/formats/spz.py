@@ -16,10 +16,10 @@ harmonics    ``128 c + 128``, to a multiple of 8 for degree 1 and of 16 above; R
 
 Colours, scales and harmonics outside their ranges are clipped. Of the fractional bits we write 12, as Niantic does, so
 that centres reach 2048; fewer if one is further away, more if the Gaussians are so small that they would move by much
-of their size. What neither would hold is refused.
+of their size. Values that neither version can hold are refused.
 
 **Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
-down, z forward). Niantic's library converts one to the other when its caller asks for it; we always do, in agreement
+down, z forward). Niantic's library converts one to the other on request; we always do, in agreement
 with a sample of three Gaussians in both formats. y and z change sign, which is a rotation by 180 degrees around x. So
 the y and z of a quaternion change sign, and so do the harmonics that are odd in y and z together, which :data:`SIGNS`
 derives from their polynomials. Programs disagree: splat-transform 2.7.1 reads what we write in the same way, 3.7.0 does
@@ -55,7 +55,7 @@ GZIPPED = (2, 3)
 FRACTIONAL_BITS, FRACTIONAL_BITS_MAX = 12, 23
 STEP_MAX = 0.1  # of the median of the largest scales; the step of 12 bits is about 0.02 of it in a usual scene
 LOG_SCALE_MIN = -10.0
-SMALLER_SHARE = 0.01  # of the Gaussians, from which on it is said that they are smaller than that
+SMALLER_SHARE = 0.01  # of the Gaussians, from which on a warning reports that they are smaller than that
 COLOR_SCALE = 0.15
 SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
 BLOCK = 1 << 20  # bytes between two moves of the progress bar
@@ -97,7 +97,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     Raises
     ------
     InputError
-        A value is not finite, a centre is out of reach, or version 4 is asked for and zstandard is not installed.
+        A value is not finite, a centre is out of range, or version 4 needs zstandard, which is not installed.
     """
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
@@ -181,7 +181,7 @@ def _to_buckets(values: Floats) -> NDArray[np.uint8]:
 
 
 def _to_vector(quats: Floats) -> NDArray[np.uint8]:
-    """Return x, y, z of unit quaternions whose w is not negative, in one byte each."""
+    """Return x, y, z of unit quaternions with w >= 0, in one byte each."""
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True) * np.where(quats[:, :1] < 0, -1.0, 1.0)
     return _to_bytes(127.5 * (quats[:, 1:] + 1.0))
 

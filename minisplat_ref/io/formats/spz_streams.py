@@ -39,7 +39,7 @@ class Streams(NamedTuple):
     frames: tuple[bytes, ...]
     """Packed, in the order of the file."""
     sizes: tuple[int, ...]
-    """Bytes of each, unpacked, as the table says."""
+    """Bytes of each, unpacked, according to the table."""
 
 
 def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes]) -> bytes:

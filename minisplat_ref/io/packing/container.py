@@ -28,7 +28,7 @@ from minisplat_ref.io.label import Label, from_json, to_json
 PARAMETERS = {"window_log": 17, "hash_log": 15, "chain_log": 16, "search_log": 3}
 LEVEL = 19  # the source of all other parameters
 HEADER_MAX = 1 << 16  # bytes
-LABEL = "label"  # the entry of a header that says how the file is drawn
+LABEL = "label"  # the entry of a header that names the file's renderer
 RATIO_MAX = 1 << 15  # bytes made of one packed byte: 2^17 of 4
 UNKNOWN_SIZE = -1  # of a frame that was written as a stream
 WAY_OUT = "copy or export the file again"
@@ -95,7 +95,7 @@ def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, 
 
 
 def pack_frame(raw: bytes) -> bytes:
-    """Return bytes as a zstandard frame that says how many they are, for files with a layout of their own.
+    """Return bytes as a zstandard frame that states their number, for files with another layout.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def is_count(value: Any, largest: int = 2**53) -> bool:
 
 
 def unpack(packed: Packed, name: str, n_bytes: int) -> bytes:
-    """Return the unpacked bytes of a stream, whose size the header tells.
+    """Return the unpacked bytes of a stream, whose size is in the header.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def unpack(packed: Packed, name: str, n_bytes: int) -> bytes:
 
 
 def unpack_frame(frame: bytes, n_bytes: int, name: str, source: str | Path) -> bytes:
-    """Return the unpacked bytes of a zstandard frame, which are to be as many as its file says.
+    """Decompress a zstandard frame; its size must match the header.
 
     Raises
     ------

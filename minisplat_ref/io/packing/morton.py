@@ -1,7 +1,7 @@
 """Morton order, in which points that are near each other in space are mostly near each other in a list.
 
 The code of a cell ``(x, y, z)`` interleaves the bits of its coordinates, ``... z1 y1 x1 z0 y0 x0``. Sorting by the code
-visits the leaves of an octree in order, so consecutive points are alike and pack well.
+visits the leaves of an octree in order, so consecutive points are similar and pack well.
 """
 
 import numpy as np

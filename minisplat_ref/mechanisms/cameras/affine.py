@@ -6,8 +6,8 @@ satellite's camera)::
     p = u_xy,   C = A_xy Sigma A_xy^T,   B = C + eps I,   Q = B^-1,   depth = u_z
 
 Nothing is expanded at the mean, so the conic is the footprint itself and not its approximation. :func:`with_affine`
-makes of any backend one that projects so; what follows, the lists and the blending, is that of 3DGS. Depths are not
-bounded by near and far planes unless the camera says so, because an altitude may be negative.
+makes of any backend one that projects so; the later stages, the lists and the blending, are those of 3DGS. Depths are
+not bounded by near and far planes unless the camera has them, because an altitude may be negative.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, P
 
 
 class AffineCamera(NamedTuple):
-    """``A`` and ``b`` of a camera, under the names of a pose, which is what the core differentiates by."""
+    """``A`` and ``b`` of a camera, under the names of a pose, with respect to which the core differentiates."""
 
     cam_from_world_R: Floats
     """[3, 3] A: pixels, pixels and units of depth per world unit. Not a rotation."""

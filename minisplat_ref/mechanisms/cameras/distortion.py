@@ -1,4 +1,4 @@
-"""What lenses do to directions, with Jacobians and inverses, in NumPy.
+"""Lens distortion of directions, with Jacobians and inverses, in NumPy.
 
 Brown's model (Brown 1966, in OpenCV's rational form; COLMAP's SIMPLE_RADIAL to FULL_OPENCV) moves the slopes ``(x, y) =
 (X / Z, Y / Z)``. With ``s = x^2 + y^2``::
@@ -11,7 +11,7 @@ radius, so that directions beyond 90 degrees have a place in the image too::
 
     r = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8),   t = atan2(|(X, Y)|, Z)
 
-Both fold where the radius no longer grows. What lies beyond has no inverse, and a point there counts as not seen.
+Both fold where the radius no longer grows. Directions beyond have no inverse, and points there count as not seen.
 """
 
 from collections.abc import Callable
@@ -190,7 +190,7 @@ def _least_root(polynomial: np.polynomial.Polynomial, limit: float) -> float:
 def _bisect(function: Callable[[Floats], Floats], wanted: Floats, limit: float) -> Floats:
     """Return where a function that grows on [0, limit] has the wanted values; NaN for larger ones.
 
-    The secant through both ends takes the place of the middle in every other step, so few steps are needed.
+    In every other step the secant through both ends replaces the middle, so few steps are needed.
     """
     low, high = np.zeros_like(wanted), np.full_like(wanted, limit)
     below, above = np.zeros_like(wanted) - wanted, function(high) - wanted

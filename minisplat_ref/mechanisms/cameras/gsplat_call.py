@@ -1,6 +1,6 @@
 """gsplat's ``rasterization`` with cameras that are no pinholes, in NumPy, for tests of other renderers.
 
-With ``with_ut`` and ``with_eval3d`` gsplat draws along the rays of a lens (:mod:`.ray_footprints`): pinholes with
+With ``with_ut`` and ``with_eval3d`` gsplat renders along the rays of a lens (:mod:`.ray_footprints`): pinholes with
 ``radial_coeffs`` (k1 to k6) and ``tangential_coeffs`` (p1, p2), and fisheyes with ``radial_coeffs`` (k1 to k4).
 ``camera_model="ortho"`` is its EWA of parallel rays, which is exact (:mod:`.affine`). A fisheye sorts by distance, as
 gsplat does with ``global_z_order=False``.
@@ -41,14 +41,14 @@ GRADIENTS = ("v_means", "v_quats", "v_scales", "v_opacities", "v_colors", "v_bac
 
 
 class Shot(NamedTuple):
-    """What one camera sees along its rays."""
+    """The view of one camera along its rays."""
 
     footprints: LensFootprints
     output: RenderOutput
 
 
 class Asked(NamedTuple):
-    """What is asked for beside the scene: the cameras, with their lenses, and how they are drawn."""
+    """The request besides the scene: the cameras, with their lenses, and the options of rendering."""
 
     cameras: tuple[Camera, ...]
     is_parallel: bool
@@ -208,7 +208,7 @@ def _ask(
     conventions: Conventions,
     steps: Steps,
 ) -> Asked:
-    """Return what is asked for, checked."""
+    """Return the request, checked."""
     model, radial, tangential, *flags = lens
     stages = get_backend(backend) if isinstance(backend, str) else backend
     if model == "ortho":

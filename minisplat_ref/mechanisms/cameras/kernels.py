@@ -1,4 +1,4 @@
-"""3D Gaussians met by rays on lanes: a response for the plain kernels, stated by differences of directions.
+"""3D Gaussians hit by rays on lanes: a response for the plain kernels, stated by differences of directions.
 
 ``b - t a`` is a difference of numbers as large as the distance in standard deviations. Here the ray is compared with
 the unit vector ``n = x / r`` to the mean instead, ``r = |x|``: with ``G = r M``, ``h = G n`` and the difference

@@ -1,4 +1,4 @@
-"""The cameras: what the optics of a :class:`~minisplat_ref.types.Camera` mean for points, pixels and the order.
+"""The cameras: the effect of a :class:`~minisplat_ref.types.Camera`'s optics on points, pixels and the order.
 
 All functions are of the camera's frame (OpenCV axes) and in float64. A model never sees the pose, so a renderer
 differentiates with respect to it by the chain rule through ``x = R mu + t`` alone.
@@ -29,7 +29,7 @@ class CameraModel(NamedTuple):
     rays: Callable[[Floats, Camera], tuple[Floats, Floats]]
     """``rays(pixels, camera)``: origins [P, 3] and unit directions [P, 3] through pixels [P, 2]; NaN where none is."""
     depths: Callable[[Floats], Floats]
-    """``depths(x)``: [N] what orders points and is bounded by the near and far planes, world units."""
+    """``depths(x)``: [N] the depth that orders points and is bounded by the near and far planes, world units."""
     depths_vjp: Callable[[Floats, Floats], Floats]
     """``depths_vjp(x, v)``: the gradient [N, 3]."""
 

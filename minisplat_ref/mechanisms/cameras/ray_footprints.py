@@ -1,4 +1,4 @@
-"""3D Gaussians met by the true rays of any central camera, in NumPy: 3DGUT's response (arXiv 2412.12507).
+"""3D Gaussians hit by the true rays of any central camera, in NumPy: 3DGUT's response (arXiv 2412.12507).
 
 In the camera's frame a Gaussian has the mean x and the whitening ``M = S^-1 (R_c R_g)^T``, with which its covariance is
 ``M^-1 M^-T``. A ray ``t d`` is nearest to it, in standard deviations, at t, and passes it at p::
@@ -70,7 +70,7 @@ class FootprintGradient(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where P rays pass G Gaussians."""
+    """The places where P rays pass G Gaussians."""
 
     rays: Floats  # [P, 3] d
     depths: Floats  # [G, P] t
@@ -80,7 +80,7 @@ class Place(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported
 def project(primitives: Primitives, camera: Camera, conventions: Conventions) -> LensFootprints:
-    """Place Gaussians in the camera's frame, bound them in its image, and cull what it cannot show.
+    """Place Gaussians in the camera's frame, bound them in its image, and cull those that it cannot show.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ Seven sigma points, the mean and two on each principal axis, are projected; noth
     x_0 = mu,   x_k = mu +- sqrt(n + lambda) s_k a_k
     w_0 = lambda / (n + lambda),   w_k = 1 / (2 (n + lambda));   for the covariance w_0 + 1 - alpha^2 + beta
 
-Here alpha = 0.1, beta = 2, kappa = 0, as there. The result bounds a footprint; it does not draw it.
+Here alpha = 0.1, beta = 2, kappa = 0, as there. The result only bounds a footprint; rendering does not use it.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A joint bilateral filter: depths are averaged over neighbours that look alike in the photograph.
+"""A joint bilateral filter: depths are averaged over neighbours of similar colour in the photograph.
 
     D'(p) = sum_q w_pq D(q) / W_p,   W_p = sum_q w_pq
     w_pq  = exp(-|p - q|^2 / (2 s^2) - |I(p) - I(q)|^2 / (2 r^2))
@@ -18,7 +18,7 @@ Window = tuple[slice, slice]
 
 
 class BilateralWidths(NamedTuple):
-    """How far neighbours count."""
+    """Widths of the filter."""
 
     radius: int = 3
     """Pixels on either side of the window's middle."""

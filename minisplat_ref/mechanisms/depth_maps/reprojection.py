@@ -1,4 +1,4 @@
-"""Reprojection: a depth map in another view, there and back, and what several views agree on (after MVSNet's fusion).
+"""Reprojection of a depth map into another view and back, and the agreement of several views (after MVSNet's fusion).
 
 A pixel p of a reference view r with the depth D is the point X. A source view k sees X at p_k and has a depth map
 itself, which there shows the point X_k; r sees that at p'' in the depth D''. The two agree on p if
@@ -6,7 +6,7 @@ itself, which there shows the point X_k; r sees that at p'' in the depth D''. Th
     |p'' - p| < e_pix   and   |D'' - D| / D < e_dep
 
 Between the centres of pixels the inverse of a depth is interpolated, since that of a plane is linear in the image. A
-source without a depth at one of the four pixels around p_k says nothing.
+source without a depth at one of the four pixels around p_k has no vote.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ class DepthView(NamedTuple):
 
 
 class RoundTrip(NamedTuple):
-    """What becomes of each pixel of a reference view by way of a source view; all [H, W]."""
+    """Errors of each pixel of a reference view after the way to a source view and back; all [H, W]."""
 
     is_seen: Bools
     """Whether the pixel has a depth, and the source one where it sees the pixel's point."""
@@ -40,7 +40,7 @@ class RoundTrip(NamedTuple):
 
 
 class Tolerances(NamedTuple):
-    """When two views agree, and how many must."""
+    """Conditions for the agreement of two views, and the number of views that must agree."""
 
     pixels: float = 1.0
     """e_pix."""
@@ -54,7 +54,7 @@ USUAL_TOLERANCES = Tolerances()
 
 
 class Agreement(NamedTuple):
-    """What a reference view and its sources agree on; both [H, W]."""
+    """The agreement of a reference view with its sources; both [H, W]."""
 
     n_agreeing: Ints
     """Sources that agree."""
@@ -119,7 +119,7 @@ def round_trip(reference: DepthView, source: DepthView) -> RoundTrip:
 
 
 def agree(reference: DepthView, sources: Sequence[DepthView], tolerances: Tolerances = USUAL_TOLERANCES) -> Agreement:
-    """Return what a reference view and its sources agree on."""
+    """Return the agreement of a reference view with its sources."""
     n_agreeing, total = np.zeros(reference.depth.shape, int), reference.depth.astype(float)
     for source in sources:
         trip = round_trip(reference, source)

@@ -6,16 +6,15 @@ Near its centre a deformation is the affine map x -> mu' + F (x - mu), which tak
     M' = U diag(s') V^T   =>   R' = U, s' the new scales            (singular values; V does not matter)
     s'_2 = |det F| s_0 s_1 s_2 / (s'_0 s'_1)
 
-The factorisation is of M', not of Sigma', whose condition number is the square of that of M': the thickness of a disc a
-thousand times as wide as thick would lose six digits more. The smallest scale comes from the volume, and so loses none.
-Where F is a rotation times a number c, the axes stay what they are, R' = Q R and s' = c s.
+The factorisation is of M', not of Sigma', since the condition number of Sigma' is the square of that of M': the
+thickness of a disc a thousand times as wide as thick would lose six digits more. The smallest scale comes from the
+volume, and so loses none. Where F is a rotation times a number c, the axes remain the same, R' = Q R and s' = c s.
 
 Colours have no shape to be sheared. They are rotated by the orthogonal factor Q of the polar decomposition
 F = Q P, P = (F^T F)^(1/2), which is the rotation nearest to F. For rigid motions this is exact; for others it is a
-choice, since a model does not know how its light came about. Opacities stay.
+choice, since a model has no record of the light that made its colours. Opacities stay.
 
-All this is computed in float64 and rounded to the dtype of the Gaussians. Rows whose F is the identity keep their
-bytes.
+All this is computed in float64 and rounded to the dtype of the Gaussians. Rows with the identity as F keep their bytes.
 """
 
 from typing import NamedTuple

@@ -33,9 +33,9 @@ def load_model(path: Path) -> Gaussians:
 
 
 def load_label(path: Path) -> Label:
-    """Return what an edited model is to say about how it is drawn: what the model of :func:`load_model` says.
+    """Return the label of an edited model: that of the model of :func:`load_model`.
 
-    An extension whose fields are left out draws it no longer.
+    An extension whose fields are left out no longer renders it.
 
     Raises
     ------

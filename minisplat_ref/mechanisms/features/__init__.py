@@ -5,10 +5,10 @@ A :class:`~minisplat_ref.mechanisms.features.bank.FeatureBank` is a pair of func
 image. There are two:
 
 - :data:`~minisplat_ref.mechanisms.features.filters.CLASSICAL`: Gabor filters of four orientations, their energies, and
-  mean colours, at three scales. Its numbers are chosen, none is learned. **It is not VGG**: it knows edges, stripes and
-  colours, not shapes or objects.
-- :func:`~minisplat_ref.mechanisms.features.network.load_bank`: convolutions whose weights the user brings as an .npz.
-  That module's docstring has the layout, and how VGG16's weights get into it.
+  mean colours, at three scales. Its numbers are chosen, none is learned. **It is not VGG**: it responds to edges,
+  stripes and colours, not to shapes or objects.
+- :func:`~minisplat_ref.mechanisms.features.network.load_bank`: convolutions with weights that the user provides as an
+  .npz. That module's docstring has the layout, and how VGG16's weights get into it.
 
 :mod:`minisplat_ref.mechanisms.features.blending` goes the other way: any number of channels of Gaussians become
 those of pixels.

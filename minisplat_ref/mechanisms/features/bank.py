@@ -1,4 +1,4 @@
-"""What a feature bank is: a function from an image to maps of features, and its gradient."""
+"""Feature banks: functions from an image to maps of features, and their gradients."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ def check_size(bank: FeatureBank, width: int, height: int, what: str) -> None:
     Raises
     ------
     InputError
-        Says which image, and how large it has to be.
+        Names the image, and the size that it has to have.
     """
     if min(width, height) < bank.min_side:
         raise InputError(

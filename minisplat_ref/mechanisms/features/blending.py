@@ -26,7 +26,7 @@ WIDTH = 3  # channels of a pass
 
 
 class BlendTape(NamedTuple):
-    """What :func:`blend_channels` keeps for its gradient."""
+    """The values that :func:`blend_channels` keeps for its gradient."""
 
     primitives: Primitives
     camera: Camera
@@ -34,7 +34,7 @@ class BlendTape(NamedTuple):
     projection: Projection
     bins: TileBins
     passes: tuple[tuple[Floats, RenderOutput], ...]
-    """[N, 3] channels, the last ones padded with zeros, and what was blended of them."""
+    """[N, 3] channels, the last ones padded with zeros, and their blended image."""
     n_channels: int
 
 

@@ -7,9 +7,9 @@ by waves under a Gaussian window, of wavelength l, at the angles t_k = k pi / 4:
     energy_k = sqrt(even_k^2 + odd_k^2 + eps^2)
 
 m makes the even filter blind to brightness; each filter is scaled so that the wave it is made for, between black and
-white, has a response of about 1. The signed responses say where in a stripe a pixel is, the energies only how strong
-it is. Three channels are the mean colour under the window, from -1 to 1. The last is constant: between vectors
-without it, the cosine would not see how strong a response is, and grey would have no direction.
+white, has a response of about 1. The signed responses give the position of a pixel in a stripe, the energies only the
+stripe's strength. Three channels are the mean colour under the window, from -1 to 1. The last is constant: between
+vectors without it, the cosine would not see how strong a response is, and grey would have no direction.
 
 Filters are applied only where they are inside the image, at the finest scale at every second pixel.
 """
@@ -80,8 +80,8 @@ def features(image: Floats) -> tuple[list[Floats], _Tape]:
 def features_vjp(tape: _Tape, v_maps: Sequence[Floats]) -> Floats:
     """Gradient of :func:`features`, from coarse to fine.
 
-    ``v_even += v_energy even / energy``, likewise odd; through the filters (:func:`..layers.convolve_vjp`); and the
-    gradient of a halved image goes on to the one it was made of.
+    ``v_even += v_energy even / energy``, likewise odd; through the filters (:func:`.layers.convolve_vjp`); and the
+    gradient of a halved image passes to the image that it was made of.
 
     Parameters
     ----------

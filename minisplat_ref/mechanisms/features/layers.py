@@ -1,4 +1,4 @@
-"""The gradients of the layers that features are made of: convolution, maximum of windows, halving.
+"""The gradients of the layers of features: convolution, maximum of windows, halving.
 
 The forward functions of the first two are :func:`~minisplat_ref.metrics.lpips.convolve` and
 :func:`~minisplat_ref.metrics.lpips.max_pool`.

@@ -1,4 +1,4 @@
-"""Features of a convolutional network whose weights the user brings; nothing is downloaded, and none are shipped.
+"""Features of a convolutional network with weights from the user; none are downloaded or shipped.
 
 The file is an .npz of plain arrays, for convolutions k = 1, 2, ... in their order, each followed by a ReLU:
 
@@ -165,8 +165,8 @@ def features(net: Convolutions, image: Floats) -> tuple[list[Floats], _Tape]:
 def features_vjp(net: Convolutions, tape: _Tape, v_maps: Sequence[Floats]) -> Floats:
     """Gradient of :func:`features`, from the last convolution to the first.
 
-    ``v_x`` of a convolution's output is what its tap and the layers behind it need; where the ReLU has cut off it is 0;
-    then follow :func:`..layers.convolve_vjp`, and :func:`..layers.max_pool_vjp` where the size was halved.
+    ``v_x`` of a convolution's output is the sum from its tap and from the layers behind it, and 0 where the ReLU has
+    cut off; then follow :func:`.layers.convolve_vjp`, and :func:`.layers.max_pool_vjp` where the size was halved.
 
     Parameters
     ----------

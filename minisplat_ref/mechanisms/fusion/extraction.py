@@ -46,7 +46,7 @@ def marching_cubes_package() -> Any:
 
 
 def extract(volume: Volume, grid: Grid, min_views: int) -> ColoredMesh:
-    """Return where the distance is 0, in the cells whose eight corners all were seen by ``min_views`` views.
+    """Return the surface of distance 0, in the cells whose eight corners all were seen by ``min_views`` views.
 
     Raises
     ------

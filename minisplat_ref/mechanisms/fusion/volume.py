@@ -1,8 +1,8 @@
-"""A grid of voxels, and what is fused in it: truncated signed distances, weights and colours.
+"""A grid of voxels with the fused truncated signed distances, weights and colours.
 
-Curless & Levoy 1996, as KinectFusion has it. A view says of a voxel at x, of depth z, how far it lies before the
-surface that the view shows there, ``s = z_surface(u, v) - z``. Behind the surface by more than the truncation t it says
-nothing; else, with the weight w of all views before,
+Curless & Levoy 1996, as KinectFusion has it. A view measures how far a voxel at x, of depth z, lies in front of the
+surface that the view shows there, ``s = z_surface(u, v) - z``. Behind the surface by more than the truncation t it is
+ignored; else, with the weight w of all views before,
 
     d = min(s / t, 1),   D <- (w D + d) / (w + 1),   w <- w + 1
 
@@ -30,7 +30,7 @@ BOUND = 2.0  # of contracted coordinates
 
 
 class Contraction(NamedTuple):
-    """Where the world is contracted."""
+    """The contraction of the world."""
 
     center: tuple[float, float, float]
     """c, world frame."""
@@ -39,7 +39,7 @@ class Contraction(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Where voxels are."""
+    """The places of the voxels."""
 
     origin: tuple[float, float, float]
     """Centre of the first voxel: world frame, or contracted."""
@@ -52,7 +52,7 @@ class Grid(NamedTuple):
 
     @property
     def n_voxels(self) -> int:
-        """How many there are."""
+        """The number of voxels."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
     def places(self, x: slice = slice(None)) -> Floats:
@@ -80,7 +80,7 @@ class Grid(NamedTuple):
 
 
 class Volume(NamedTuple):
-    """What voxels hold, C-contiguous float32."""
+    """The data of voxels, C-contiguous float32."""
 
     distances: Floats
     """[nx, ny, nz] D in [-1, 1]; 0 where nothing was seen."""
@@ -89,11 +89,11 @@ class Volume(NamedTuple):
     colors: Floats
     """[nx, ny, nz, 3] mean RGB of the views near the surface."""
     n_near: Floats
-    """[nx, ny, nz] how many these are."""
+    """[nx, ny, nz] number of these views."""
 
 
 class DepthMap(NamedTuple):
-    """What a view says of the surface."""
+    """The surface in one view."""
 
     depth: Floats
     """[H, W] camera z of the surface, world units; 0 where it shows none."""
@@ -107,7 +107,7 @@ def empty_volume(grid: Grid) -> Volume:
     Raises
     ------
     InputError
-        It does not fit into memory; the line says which voxel does.
+        It does not fit into memory; the message suggests a voxel size that does.
     """
     needed, free = PEAK_BYTES_PER_VOXEL * grid.n_voxels, free_bytes()
     if needed > free:

@@ -1,4 +1,4 @@
-"""Shading once per pixel: materials blended by surfels, an environment, and what hides it.
+"""Shading once per pixel: materials blended by surfels, an environment, and its occlusion.
 
 ``environment``  light that comes from infinitely far away, one colour for each direction
 ``prefilter``    the same light averaged over the lobe of a rough surface, and over the hemisphere of a matte one
@@ -13,5 +13,5 @@
 ``renderer``     shading surfel by surfel, or pixel by pixel
 ``training``     the stages of Ref-Gaussian's training
 
-Each function that training differentiates stands beside its gradient.
+Each function that training differentiates is followed by its gradient.
 """

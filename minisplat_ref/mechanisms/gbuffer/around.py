@@ -17,7 +17,7 @@ from minisplat_ref.types import Floats
 
 
 class Sight(NamedTuple):
-    """How a camera sees M surfels."""
+    """The view of a camera on M surfels."""
 
     x: Floats
     """[M, 3] centres, camera frame."""
@@ -39,7 +39,7 @@ class AroundGradient(NamedTuple):
 
 
 def sight_of(means: Floats, normals: Floats, pose: tuple[Floats, Floats]) -> Sight:
-    """Return how a camera of a pose (R, t) sees surfels at ``means`` [M, 3], world frame."""
+    """Return the view of a camera of the pose (R, t) on surfels at ``means`` [M, 3], world frame."""
     R, t = pose
     x = means @ R.T + t
     return Sight(x, x / np.linalg.norm(x, axis=1, keepdims=True), normals, R)

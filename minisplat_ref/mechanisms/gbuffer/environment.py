@@ -17,7 +17,7 @@ from minisplat_ref.types import Floats, Ints
 
 
 class Places(NamedTuple):
-    """Where P directions read an image of H x W texels."""
+    """The places at which P directions read an image of H x W texels."""
 
     texels: Ints
     """[4, P] indices i W + j of the texels: upper left, upper right, lower left, lower right."""
@@ -44,7 +44,7 @@ def texel_directions(height: int, width: int) -> tuple[Floats, Floats]:
 
 
 def locate(directions: Floats, height: int, width: int) -> Places:
-    """Return where unit directions [P, 3] read an image of ``height`` x ``width`` texels."""
+    """Return the places at which unit directions [P, 3] read an image of ``height`` x ``width`` texels."""
     x, y, z = directions.T
     rho2 = x * x + y * y
     rho = np.sqrt(rho2)

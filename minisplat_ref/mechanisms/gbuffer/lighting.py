@@ -1,4 +1,4 @@
-"""The environment of a model, and another in its place: relighting.
+"""The environment of a model, and its replacement: relighting.
 
 A model that was trained with an environment has it as the shared parameter ``log_environment``, the logarithm of linear
 RGB in latitude and longitude, so that no training makes light negative. Another comes from a file: an image in sRGB, or

@@ -1,4 +1,4 @@
-"""Surfels with a material, how they start, and what they have in common: the environment, and how far training is."""
+"""Surfels with a material, their start, and their shared parameters: the environment, and the stage of training."""
 
 from collections.abc import Mapping
 from typing import NamedTuple

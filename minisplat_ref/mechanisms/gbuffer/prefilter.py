@@ -1,4 +1,4 @@
-"""An environment as rough and as matte surfaces see it: averages of its texels, so matrices.
+"""An environment filtered for rough and for matte surfaces: averages of its texels, hence matrices.
 
 A rough surface seen from straight above (normal, view and reflection n = v = r, as the split sum of Karis 2013 assumes)
 averages the environment over the lobe of GGX, alpha = roughness^2, half vector h of l and r::
@@ -11,8 +11,8 @@ matte surface averages over the cosine, which a few spherical harmonics hold (Ra
 
     E(n) = sum_k a_l(k) L_k Y_k(n),   L_k = sum_l Y_k(l) L_l w_l,   a = 1, 2/3, 1/4
 
-E is the irradiance over pi: a constant environment of 1 gives 1, exactly. What the harmonics beyond degree 2 hold is
-left out; it is at most a few per cent of what a single lamp gives.
+E is the irradiance over pi: a constant environment of 1 gives 1, exactly. The harmonics beyond degree 2 are left out;
+they add at most a few per cent of the light of a single lamp.
 """
 
 import functools

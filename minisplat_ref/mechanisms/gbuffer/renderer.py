@@ -1,7 +1,7 @@
-"""How reflective surfels are drawn: shaded one by one and then blended, or blended and then shaded pixel by pixel.
+"""Rendering of reflective surfels: shaded one by one and then blended, or blended and then shaded pixel by pixel.
 
-The shared parameter ``shading_stage`` says which (:mod:`.population`). Per surfel, each has a colour, which is blended
-as in 2D Gaussian Splatting. Per pixel, what is blended are materials, normals and the light from around::
+The shared parameter ``shading_stage`` selects which (:mod:`.population`). Per surfel, each has a colour, which is
+blended as in 2D Gaussian Splatting. Per pixel, materials, normals and the light from around are blended::
 
     X = sum_i w_i x_i / A,   n = sum_i w_i n_i / |sum_i w_i n_i|,   image = A tone(shade(X, n)) + (1 - A) background
 
@@ -50,7 +50,7 @@ GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
 
 
 class MaterialGradient(NamedTuple):
-    """Gradient of the loss with respect to what materials are made of."""
+    """Gradient of the loss with respect to the parameters of materials."""
 
     fields: Mapping[str, Floats]
     """By the fields of the population that only materials are made of."""
@@ -61,14 +61,14 @@ class MaterialGradient(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """How surfels have their materials: one for a whole surfel, as :data:`FLAT`, or another one at each of its points.
+    """The materials of surfels: one for a whole surfel, as :data:`FLAT`, or another one at each of its points.
 
     The functions of blending are those of :mod:`minisplat_ref.mechanisms.surfels.renderer`, or take ``carried`` in
     another form; a tape has ``shown``, and normals and materials are in the same channels.
     """
 
     carried: Callable[[discs.Seen], Any]
-    """What the surfels of a view bring along."""
+    """The materials of the surfels of a view, as ``blend`` takes them."""
     carried_vjp: Callable[[discs.Seen, Any], MaterialGradient]
     """Gradient of ``carried``."""
     blend: Callable[..., tuple[RenderOutput, Any]] = discs.blend
@@ -76,7 +76,7 @@ class Materials(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """The pixels that show a surfel, and what was blended there."""
+    """The pixels that show a surfel, and the blended values there."""
 
     rows: Ints  # [P] y W + x
     alpha: Floats  # [P] A
@@ -86,7 +86,7 @@ class _Pixels(NamedTuple):
 
 
 class ReflectiveTape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     model: Model
     seen: discs.Seen
@@ -210,7 +210,7 @@ def render(
 
 
 def render_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`, by the chain rule; how much of the environment is visible is held constant.
+    """Gradient of :func:`render`, by the chain rule; the visibility of the environment is constant.
 
     Per pixel::
 
@@ -321,7 +321,7 @@ def _pixels(output: RenderOutput, slices: dict[str, slice], camera: Camera, requ
 
 
 def _visibility(surface: Surface, output: RenderOutput, pixels: _Pixels, seen: discs.Seen, request: Request) -> Floats:
-    """Return how much of the environment the reflected ray of each pixel sees."""
+    """Return the fraction of the environment that the reflected ray of each pixel sees."""
     depth = output.image.reshape(-1, output.image.shape[2])[pixels.rows, 3] / pixels.alpha
     camera = with_principal_point(seen.camera, request.conventions)
     R, t = pose(camera, np.dtype(np.float64))
@@ -335,7 +335,7 @@ def _visibility(surface: Surface, output: RenderOutput, pixels: _Pixels, seen: d
 
 
 def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
-    """Return the derivative with respect to what was blended from that of the wanted channels."""
+    """Return the derivative with respect to the blended values from that of the requested channels."""
     blended, maps = tape.slices, tape.request.wants & MAPS.keys()
     first = max(part.stop for part in blended.values())
     has_carried = tape.pixels is not None or bool(maps)

@@ -6,8 +6,9 @@ With the albedo a, the metallic share m, the roughness, the unit normal n and th
     L = V L_env(r, roughness) + (1 - V) L_around
     c = a (1 - m) E(n) + (F_0 S(n.v, roughness) + B(n.v, roughness)) L
 
-E and L_env are those of :mod:`.prefilter`, S and B those of :mod:`.brdf`. V in [0, 1] is how much of the environment a
-reflected ray sees, and L_around what it sees of the scene instead (Ref-Gaussian, Yao et al. 2024, arXiv 2412.19282).
+E and L_env are those of :mod:`.prefilter`, S and B those of :mod:`.brdf`. V in [0, 1] is the visibility of the
+environment along a reflected ray, and L_around the light of the scene that hides it (Ref-Gaussian, Yao et al. 2024,
+arXiv 2412.19282).
 """
 
 from typing import NamedTuple
@@ -43,7 +44,7 @@ class Surface(NamedTuple):
 
 
 class Around(NamedTuple):
-    """What reflected rays see of the scene itself."""
+    """The light of the scene itself along reflected rays."""
 
     visibility: Floats
     """[P] V; it has no gradient."""
@@ -52,7 +53,7 @@ class Around(NamedTuple):
 
 
 class ShadingTape(NamedTuple):
-    """What :func:`shade` keeps for :func:`shade_vjp`."""
+    """The values that :func:`shade` keeps for :func:`shade_vjp`."""
 
     surface: Surface
     light: Filtered

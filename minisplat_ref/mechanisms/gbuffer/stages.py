@@ -56,7 +56,7 @@ def shading_stage(
     further: Callable[[Drawn], Sequence[np.ndarray]] = lambda drawn: (),
     fixed: Sequence[str] = (),
 ) -> Stage:
-    """Return a renderer at a stage of shading; what reflected rays see is held at random values.
+    """Return a renderer at a stage of shading; the light along reflected rays has fixed random values.
 
     Parameters
     ----------

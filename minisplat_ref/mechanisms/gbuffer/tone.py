@@ -1,6 +1,6 @@
 """From linear light to the sRGB of photographs (IEC 61966-2-1), without an upper limit.
 
-A photograph ends at 1; what would be brighter keeps its gradient here, so that it can become darker.
+A photograph ends at 1; brighter colours keep their gradient here, so that they can become darker.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""How shaded surfels are trained: the stages of shading, and how normals are helped to spread (Ref-Gaussian)."""
+"""Training of shaded surfels: the stages of shading, and the propagation of normals (Ref-Gaussian)."""
 
 from functools import partial
 
@@ -46,7 +46,7 @@ SHADING_RATES = Rates(
     {"albedo_logits": 0.01, "metallic_logits": 0.01, "roughness_logits": 0.01, ENVIRONMENT: 0.01, STAGE: 0.0},
     frozenset(),
 )
-"""Of the materials and of what all surfels share."""
+"""Of the materials and of the shared parameters."""
 
 SHADING_EVENTS = (
     Every(

@@ -1,13 +1,13 @@
-"""How much light comes through a scene of surfels along any rays: reflected ones, or ones to a lamp.
+"""Transmittance of a scene of surfels along arbitrary rays: reflected ones, or ones to a lamp.
 
 The ray ``O + t d`` meets the disc of the centre mu, the axes r_0 and r_1, the normal n and the deviations s at::
 
     t = n.(mu - O) / n.d,   u = (O + t d - mu).r_0 / s_0,   v = (O + t d - mu).r_1 / s_1
     alpha = min(alpha_max, o exp(-(u^2 + v^2) / 2))
 
-and what is left is the product of all 1 - alpha, in any order. Hits of alpha below ``alpha_min`` do not count, and no
-more are sought where less than ``transmittance_min`` is left. There is no low-pass: a disc is hit where it is. No
-gradient is given; what is hidden changes in steps.
+and the transmittance is the product of all 1 - alpha, in any order. Hits of alpha below ``alpha_min`` do not count, and
+no more are sought where less than ``transmittance_min`` is left. There is no low-pass: a disc is hit where it is. There
+is no gradient; visibility changes in steps.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ RAYS_AT_ONCE = 256  # in NumPy
 
 
 def transmittances(primitives: Primitives, rays: Rays, conventions: Conventions, backend: Backend) -> Floats:
-    """Return what is left of the light along each ray.
+    """Return the transmittance of each ray.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ Back: the corners of an edited polygon give spans again, and these an ellipse. T
 - :func:`by_gram_schmidt`, the paper's: the first corner gives the first span, the corner a quarter further on the
   second, less its component along the first. It is exact where the spans stay perpendicular, and loses any shear.
 
-Everything is float64. Left out: what is drawn between the corners; files.
+Everything is float64. Left out: rendering between the corners; files.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ ROUNDINGS = 32  # of the largest coordinate, which spans may be off a right angl
 
 
 class Flat(NamedTuple):
-    """Flat Gaussians without what is not geometry."""
+    """The geometry of flat Gaussians."""
 
     means: Floats
     """[N, 3] world frame."""
@@ -74,7 +74,7 @@ def plane_axes(log_scales: Floats) -> Ints:
 def turn_balls(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
     """Return the Gaussians with a random rotation for each ball.
 
-    Training starts from balls, whose axes say nothing. All would become flat along the first of them, face the same
+    Training starts from balls, whose axes are arbitrary. All would become flat along the first of them, face the same
     way, and be invisible to a camera in their planes.
 
     Parameters
@@ -220,7 +220,7 @@ def by_gram_schmidt(corners: Floats, radii: Floats) -> Flat:
 
 
 def min_widths(corners: Floats) -> Floats:
-    """Return how wide polygons are, across over along: 0 where all corners coincide or lie on one line.
+    """Return the aspect of polygons, across over along: 0 where all corners coincide or lie on one line.
 
     Parameters
     ----------

@@ -23,12 +23,12 @@ _COLOR = "_COLOR"  # trimesh writes floats only under such a name
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a name that says no format, or one that needs a package that is not installed.
+    """Refuse a name without a known format, or one that needs a package that is not installed.
 
     Raises
     ------
     InputError
-        One line that says which suffixes there are, or how to install trimesh.
+        One line with the known suffixes, or the command that installs trimesh.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path} is not named like a mesh: give a name that ends in {', '.join(SUFFIXES)}")
@@ -55,7 +55,7 @@ def trimesh_package() -> Any:
 
 
 def write_mesh(path: Path, mesh: ColoredMesh) -> None:
-    """Write a mesh in the format that its suffix says, complete or not at all.
+    """Write a mesh in the format of its suffix, complete or not at all.
 
     A PLY has float64 coordinates, so that a scene far from the origin keeps its place; glTF has float32.
 
@@ -98,7 +98,7 @@ def to_glb(vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> by
       levels of sRGB and make the darkest seven black. Opacity is not encoded in sRGB and stays as it is.
     - The material is unlit (KHR_materials_unlit), because the colours contain the light of the photographs. A program
       without this extension lights a matt surface; glTF's default material is a metal, which mirrors its surroundings.
-    - Triangles are visible from the front only, unless ``doubleSided`` says otherwise. No camera has seen the back of
+    - Triangles are visible from the front only, unless ``doubleSided`` is set. No camera has seen the back of
       a fused surface, and from outside a room one looks through its walls.
 
     Parameters
@@ -106,7 +106,7 @@ def to_glb(vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> by
     vertices : ndarray of shape (P, 3)
         World frame, world units.
     colors : ndarray of shape (P, 3) or (P, 4)
-        sRGB, and opacity if there is one; what is outside [0, 1] is clipped.
+        sRGB, and opacity if there is one, clipped to [0, 1].
     faces : ndarray of shape (T, 3)
         Rows of the vertices, counter-clockwise seen from outside.
     **material

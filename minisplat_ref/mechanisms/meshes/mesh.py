@@ -142,7 +142,7 @@ def check_same_faces(rest: Mesh, deformed: Mesh, source: str | Path) -> None:
     Raises
     ------
     InputError
-        They differ; the line says how.
+        They differ; the message names the difference.
     """
     if len(deformed.vertices) != len(rest.vertices) or not np.array_equal(deformed.faces, rest.faces):
         raise InputError(

@@ -4,9 +4,9 @@
 
     f(x, t) = sum_b phi_b(x) sum_p tau_p(t) a_bp,   phi_b(x) = exp(-|x - c_b|^2 / (2 h^2)),   tau_p(t) = t^p, p = 1 .. P
 
-so that f is zero at time 0, and everywhere if all a are. What is linear in f needs no further formula: the time
-derivative has the powers' derivatives in place of tau, and an integral over time has their integrals. All functions
-take these numbers as ``tau``.
+so that f is zero at time 0, and everywhere if all a are. Anything linear in f needs no further formula: the time
+derivative has the powers' derivatives instead of tau, and an integral over time has their integrals. All functions take
+these numbers as ``tau``.
 
 Here are N places, B basis functions, P powers, and values of D numbers each.
 """

@@ -1,6 +1,6 @@
 """The velocity of a warp in three forms, and its integral over time.
 
-A *forward* warp takes a place of time 0, the canonical place y, to where it is at time t: ``x = W(y, t)``, with the
+A *forward* warp maps a place at time 0, the canonical place y, to its place at time t: ``x = W(y, t)``, with the
 Jacobian ``J = dW/dy``. A *backward* warp w takes the place x at time t to y, with ``J_w = dw/dx``. If each is the
 inverse of the other, then
 
@@ -9,7 +9,7 @@ inverse of the other, then
     (iii)  v = -J_w^-1 dw/dt at x          the same as (i), from the backward warp: w(x(t), t) is constant
 
 and ``v = J u``. (ii) is the step of Lucas and Kanade, 1981, and the form after which Gaussian Splatting Lucas-Kanade is
-named: the displacement before a warp that does what a step of time does. It is not a velocity in the world.
+named: the displacement before a warp that has the effect of a step of time. It is not a velocity in the world.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ class Warp(NamedTuple):
         return self.shifts.shape[1]
 
     def at(self, places: Floats, time: float) -> Floats:
-        """Return where canonical places [N, 3] are at a time."""
+        """Return canonical places [N, 3] at a given time."""
         return places + self._field(places, powers(time, self.degree))
 
     def rate(self, places: Floats, time: float) -> Floats:
@@ -120,7 +120,7 @@ def invert(warp: Warp, places: Floats, time: float) -> Floats:
 
 
 def integrate(velocity: Callable[[Floats, float], Floats], start: Floats, time: float, step: float, n: int) -> Floats:
-    """Return where places are after a time, by the classical Runge-Kutta method of fourth order.
+    """Return places after a time, by the classical Runge-Kutta method of fourth order.
 
     ::
 
@@ -134,7 +134,7 @@ def integrate(velocity: Callable[[Floats, float], Floats], start: Floats, time: 
     start : ndarray of shape (N, 3)
         x at ``time``.
     time, step : float
-        t, and how long to integrate.
+        t, and the length of the integration.
     n : int
         Number of steps of length ``h = step / n``.
     """

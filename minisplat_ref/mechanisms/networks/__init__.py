@@ -1,4 +1,4 @@
-"""Small networks and encodings of their input, with gradients written by hand: NumPy, and kernels beside it.
+"""Small networks and encodings of their input, with gradients written by hand, in NumPy and as kernels.
 
 =====================  ==================  ====================================================================
 :mod:`.mlp`            `.mlp_kernels`      fully connected layers with (leaky) ReLUs between them
@@ -13,6 +13,6 @@ names, arguments and results. In the kernels every sum has a fixed order, so res
 threads.
 
 A relative brings the sizes, and keeps weights and tables as shared parameters of its representation
-(:func:`.mlp.to_shared`), so that Adam trains them, by name, and a run saves them. Its renderer computes from a
-population and these what 3DGS draws, and propagates the gradient back.
+(:func:`.mlp.to_shared`), so that Adam trains them, by name, and a run saves them. Its renderer computes Gaussians of
+3DGS from a population and these, and propagates the gradient back.
 """

@@ -5,7 +5,7 @@
     c(x) = x                        where |x| <= 1
            (2 - 1 / |x|) x / |x|    elsewhere
 
-It is in NumPy alone: a pass over three numbers a row is nothing beside a network.
+It is in NumPy alone: a pass over three numbers a row is negligible compared with a network.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from minisplat_ref.types import Floats
 
 
 def contract(x: Floats) -> Floats:
-    """Return c(x) of points [B, 3], in units in which what matters most is within 1 of the origin."""
+    """Return c(x) of points [B, 3], in units in which the main part of the scene is within 1 of the origin."""
     r = np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1)
     return (2 - 1 / r) * x / r
 

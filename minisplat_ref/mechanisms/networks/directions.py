@@ -1,6 +1,6 @@
 """The direction from which a camera sees a point, as input of a network, and its gradient.
 
-It is in NumPy alone: a few operations per point, beside a network that has kernels.
+It is in NumPy alone: a few operations per point are negligible compared with a network, which has kernels.
 """
 
 import numpy as np

@@ -19,7 +19,7 @@ def encode(x: Floats, n_octaves: int) -> Floats:
     Parameters
     ----------
     x : ndarray of shape (B, D)
-        Of period 2: what differs by 2 has one encoding.
+        Of period 2: numbers that differ by 2 have one encoding.
     n_octaves : int
         K.
     """

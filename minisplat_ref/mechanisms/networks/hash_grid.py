@@ -9,8 +9,9 @@ where the table has room for all of them, and else (eq. 4), with products modulo
 
     h(i, j, k) = (i xor 2654435761 j xor 805459861 k) mod T
 
-so several vertices share a row, and training decides whose it is. The encoding of a point is, level by level, the
-trilinear interpolation of the features at the eight vertices around it. Points outside the cube are moved to its faces.
+so several vertices share a row, and training decides which of them matters. The encoding of a point is, level by level,
+the trilinear interpolation of the features at the eight vertices around it. Points outside the cube are moved to its
+faces.
 
 Of the paper's encoding, the half cell by which later releases shift the levels is left out.
 """

@@ -115,7 +115,7 @@ def train_step(network: Network, x: Floats, y: Floats, rate: float, moments: lis
     ----------
     network : Network
     x, y : ndarray of shape (B, inputs) and (B, outputs)
-        What it should map to what.
+        Inputs and the outputs that they should map to.
     rate : float
         Learning rate.
     moments : list of ndarray

@@ -1,5 +1,5 @@
-"""Oriented points and primitives: planes through near points, and the normal that a Gaussian has.
+"""Oriented points and primitives: planes through near points, and the normal of a Gaussian.
 
 :mod:`.planes` fits a plane to the neighbours of each point; :mod:`.thin_axis` is the normal of a population with its
-gradient, so that a loss on normals serves Gaussians (their shortest axis) and surfels (their third) alike.
+gradient, so that a loss on normals serves both Gaussians (their shortest axis) and surfels (their third).
 """

@@ -4,7 +4,7 @@ With the k nearest points p_j of a point, itself among them, and their mean m, t
 
     C = 1/k sum_j (p_j - m) (p_j - m)^T
 
-and the normal is that of the least eigenvalue. Nothing says which side is outside, so normals are turned towards
+and the normal is that of the least eigenvalue. The outside is unknown, so normals are turned towards
 places that see the point, such as the cameras, where these are known.
 """
 
@@ -51,7 +51,7 @@ def fit_planes(points: Floats, n_neighbours: int = N_NEIGHBOURS, towards: Floats
     points : ndarray of shape (P, 3)
         World frame.
     n_neighbours : int
-        k; fewer if there are not so many points.
+        k; fewer if there are not enough points.
     towards : ndarray of shape (C, 3), optional
         Places from which the surface is seen: each normal is turned to the nearest of them.
 

@@ -2,7 +2,7 @@
 
     n = R(q) e_a,   a = argmin_j log s_j; for a population with two scales a = 2
 
-Its sign is open; losses take the absolute value of a cosine. Which axis is the shortest is held constant in the
+Its sign is open; losses take the absolute value of a cosine. The choice of the shortest axis is constant in the
 gradient, as it is almost everywhere.
 """
 

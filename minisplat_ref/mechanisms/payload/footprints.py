@@ -1,4 +1,4 @@
-"""What a camera sees of Gaussians with a payload: the ellipses of 3DGS, and data beside them."""
+"""Footprints of Gaussians with a payload: the ellipses of 3DGS, with the payload's data."""
 
 from dataclasses import dataclass
 

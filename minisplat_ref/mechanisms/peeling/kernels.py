@@ -82,11 +82,11 @@ class Planes(NamedTuple):
     anchors: Ints
     """[T, 2] int32 pixel x, y."""
     boxes: Ints
-    """[T, 4] int32 half-open x0, y0, x1, y1; empty where the triangle is not drawn."""
+    """[T, 4] int32 half-open x0, y0, x1, y1; empty where the triangle is not rendered."""
 
 
 class Fragments(NamedTuple):
-    """What triangles cover."""
+    """The pixels that triangles cover."""
 
     offsets: Ints
     """[T + 1] int64; triangle n owns the fragments offsets[n]:offsets[n + 1]."""
@@ -106,13 +106,13 @@ class Layers(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What the gradient needs again."""
+    """The values that the gradient needs again."""
 
     camera_vertices: Floats  # [P, 3] float64
     fragments: Fragments
     layers: Layers
     shades: Floats  # [F, 4] colour and alpha of each
-    transmittances: Floats  # [F] in front of each; 0 for what was not blended
+    transmittances: Floats  # [F] in front of each; 0 for fragments that were not blended
     n_blended: Ints  # [H W] int64
     T_end: Floats  # [H W]
 
@@ -202,7 +202,7 @@ def _set_up(vertices, faces, pinhole, planes):
         P_0, P_1, P_2 = vertex(vertices, faces, n, 0), vertex(vertices, faces, n, 1), vertex(vertices, faces, n, 2)
         row_1, row_2, normal, volume = inverse_rows(P_0, P_1, P_2)
         boxes[n, :] = 0
-        # Written so that NaN is not drawn.
+        # Written so that NaN is not rendered.
         if not abs(volume) > pinhole.min_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
             continue
         box = np.inf, np.inf, -np.inf, -np.inf
@@ -313,7 +313,7 @@ def _list(planes, rays, rooms, counts):
 
 @kernel()
 def _move_together(rooms, fragments):
-    """Copy what is written of each triangle's room to where it belongs."""
+    """Move the written part of each triangle's room to its final place."""
     starts, room_pixels, room_places = rooms
     offsets, pixels, places = fragments
     for n in prange(offsets.size - 1):
@@ -327,7 +327,7 @@ def _move_together(rooms, fragments):
 def _fragments_of(planes: Planes, rays: Rays, dtype: np.dtype) -> Fragments:
     """Return the fragments of all triangles, in the order of these.
 
-    A triangle gets as much room as its box has pixels, is drawn into it once, and its fragments are then moved
+    A triangle gets as much room as its box has pixels, is rasterised into it once, and its fragments are then moved
     together. Where all boxes would take too much memory, fragments are counted before.
     """
     extents = planes.boxes[:, 2:] - planes.boxes[:, :2]

@@ -1,20 +1,20 @@
-"""Translucent triangle meshes, and what peeling their layers returns: bundles that the reference and the kernels share.
+"""Translucent triangle meshes, and the result of peeling their layers: bundles of the reference and the kernels.
 
 A mesh has a colour and an opacity at each vertex, (r, g, b, a), which are linear on its triangles: with the barycentric
 coordinates b of the point where a pixel's ray meets a triangle, ``(c, alpha) = sum_i b_i (c_i, a_i)``. Both sides of a
-triangle are drawn. A pixel blends what its ray meets, nearest first::
+triangle are rendered. A pixel blends the triangles that its ray hits, nearest first::
 
     image = sum_l c_l alpha_l T_l + T_end background,   T_l = prod_{j before l} (1 - alpha_j),   alpha = 1 - T_end
 
-That is 3DGS's compositing, but without its thresholds: no alpha is clamped or skipped, and an opaque mesh is drawn as a
-z-buffer does. Depth peeling (Everitt 2001) finds the layers of all pixels one after the other; a graphics program peels
-a fixed number of them, and leaves out what lies behind.
+That is 3DGS's compositing, but without its thresholds: no alpha is clamped or skipped, and an opaque mesh is rendered
+as by a z-buffer. Depth peeling (Everitt 2001) finds the layers of all pixels one after the other; a graphics program
+peels a fixed number of them, and leaves out the layers behind.
 
 - A pixel belongs to a triangle if its centre lies inside. On an edge, exactly, it belongs to the one of two neighbours
   that also contains the point a little to the right, or else below: neither to both nor to none.
 - Of equally distant triangles the first in the list is in front.
-- What is not further than the near plane is not drawn, pixel by pixel: a triangle may pass through it.
-- A triangle that is seen at less than ``ANGLE_MIN``, or has no area, is not drawn.
+- Fragments not beyond the near plane are left out, pixel by pixel: a triangle may pass through it.
+- A triangle that is seen at less than ``ANGLE_MIN``, or has no area, is not rendered.
 
 The gradient holds coverage and order fixed: at the border of a mesh that is not transparent there, the image jumps.
 """
@@ -49,7 +49,7 @@ class Frame(NamedTuple):
     near: float
     """Camera z of the near plane, world units."""
     max_layers: int = ALL_LAYERS
-    """Of a pixel, at least 1; what lies behind them is left out."""
+    """Of a pixel, at least 1; layers behind them are left out."""
 
 
 class Peeled(NamedTuple):
@@ -64,11 +64,11 @@ class Peeled(NamedTuple):
     is_seen: Bools
     """[T] whether a pixel's ray meets the triangle."""
     tape: Any
-    """For the gradient, of the implementation that drew it."""
+    """For the gradient, of the implementation that rendered it."""
 
 
 class PeelGradient(NamedTuple):
-    """Gradient of the loss with respect to what an image of a mesh depends on."""
+    """Gradient of the loss with respect to the inputs of a mesh's image."""
 
     vertices: Floats
     """[P, 3] world frame."""
@@ -93,7 +93,7 @@ def gradient_of(
 
 
 def check_translucent(mesh: TranslucentMesh, source: object) -> None:
-    """Refuse a mesh whose numbers do not make an image; ``source`` is what messages begin with.
+    """Refuse a mesh whose numbers do not make an image; ``source`` is the beginning of messages.
 
     Raises
     ------
@@ -110,5 +110,5 @@ def check_translucent(mesh: TranslucentMesh, source: object) -> None:
 
 
 def to_bytes(rgba: Floats) -> NDArray[np.uint8]:
-    """Return colours and opacities as mesh files have them, 0 to 255; what is outside [0, 1] is clipped."""
+    """Return colours and opacities as mesh files have them, 0 to 255, after clipping to [0, 1]."""
     return np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8)

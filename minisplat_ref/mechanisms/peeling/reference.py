@@ -28,7 +28,7 @@ PAIRS_AT_ONCE = 1 << 20  # of a triangle and a pixel of its box, which are teste
 
 
 class Fragments(NamedTuple):
-    """Where rays meet triangles, F times; in the order of the pixels, nearest first."""
+    """F intersections of rays and triangles, in the order of the pixels, nearest first."""
 
     pixels: Ints  # [F] flat index
     faces: Ints  # [F]
@@ -38,7 +38,7 @@ class Fragments(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What the gradient needs again."""
+    """The values that the gradient needs again."""
 
     corners: Floats  # [T, 3, 3] camera frame
     fragments: Fragments  # of the layers that were blended
@@ -94,7 +94,7 @@ def peel_vjp(
 ) -> PeelGradient:
     """Gradient of :func:`peel`.
 
-    A pixel of derivatives v, v_A goes through its layers from behind. What lies behind layer l is worth s_l, and needs
+    A pixel of derivatives v, v_A goes through its layers from behind. The light from behind layer l is s_l, and needs
     no division by ``1 - alpha``, which is zero for an opaque one::
 
         s_last = v . background,           s_(l-1) = alpha_l (v . c_l + v_A) + (1 - alpha_l) s_l
@@ -148,7 +148,7 @@ def peel_vjp(
 
 
 def meet(corners: Floats, frame: Frame) -> Fragments:
-    """Return where the rays of all pixels meet triangles.
+    """Return the intersections of the rays of all pixels with triangles.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""What rays see of Gaussians of any kind, in NumPy: every ray meets every Gaussian.
+"""Blending along rays through Gaussians of any kind, in NumPy: every ray is tested against every Gaussian.
 
-How a ray meets one is the extension's, as a :class:`Meeting`. Hits are taken in the order of t, of equal ones the lower
-row first, with the weights ``w_i = alpha_i T_i`` of 3DGS equation (3), ``alpha = min(alpha_max, unclamped)``. What does
-not count: ``alpha < alpha_min``, t outside of the ray's limits, and everything from the hit on that would take the
-transmittance to its least value.
+The extension defines where a ray meets a primitive, as a :class:`Meeting`. Hits are sorted by t, ties by row, and have
+the weights ``w_i = alpha_i T_i`` of 3DGS equation (3), ``alpha = min(alpha_max, unclamped)``. What does not count:
+``alpha < alpha_min``, t outside of the ray's limits, and every hit from the one on that would reduce the transmittance
+to its minimum.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,12 +21,12 @@ PAIRS_AT_ONCE = 1 << 18  # of rays and Gaussians: some thirty arrays of float64,
 
 
 class IntersectionGradient(NamedTuple):
-    """Gradient with respect to what a Gaussian and a ray are, pair by pair."""
+    """Gradient with respect to the parameters of a Gaussian and of a ray, pair by pair."""
 
     means: Floats
     """[H, 3]."""
     shapes: Floats
-    """[H, ...] with respect to what the extension makes of quaternions and scales."""
+    """[H, ...] with respect to the shapes that the extension makes of quaternions and scales."""
     opacities: Floats
     """[H]."""
     origins: Floats
@@ -36,7 +36,7 @@ class IntersectionGradient(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """How rays meet the Gaussians of a population."""
+    """The intersection of rays with the Gaussians of a population."""
 
     n: int
     """Gaussians."""

@@ -1,7 +1,7 @@
 """Rays through a tree of Gaussians, forward and back: ``mechanisms.rays.blending`` without testing every Gaussian.
 
-The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
-own, and each Gaussian then adds up its rows in the order of the rays.
+The gradient needs no lock and depends on no order of threads: each ray writes the contributions of its hits to separate
+rows, and each Gaussian then sums its rows in the order of the rays.
 
 Bundles that a kernel writes to are taken apart first: Numba drops ``bundle.array[i] = x`` from a parallel loop.
 """
@@ -28,7 +28,7 @@ HITS_KEPT_MAX = 1 << 24  # 470 MB
 
 
 class RayResponse(NamedTuple):
-    """What one row of a tree does to a ray."""
+    """The response of one row of a tree to a ray."""
 
     meet: Callable
     """``meet(records, row, ray)`` of eight rays: see :func:`~minisplat_ref.mechanisms.rays.traversal.finder`."""
@@ -295,7 +295,7 @@ def _blend(
     conventions: Conventions,
     room: int,
 ) -> tuple[BlendedRays, int]:
-    """Return what the rays see, with their hits if these fit into ``room``, and the room that they need."""
+    """Return the colours of the rays, with their hits if these fit into ``room``, and the room that they need."""
     n, n_hits = len(rays.near), np.empty(len(rays.near), np.int64)
     image, depths, transmittances, is_seen = np.empty((n, 3)), np.empty(n), np.empty(n), np.zeros(tree.n, bool)
     starts, rows, n_used = np.empty(n, np.int64), np.empty(room, np.int32), np.zeros(1, np.int64)

@@ -1,4 +1,4 @@
-"""Rays through pixels, what they meet, and blend statistics: what the ray tracers of Gaussians share.
+"""Rays through pixels, their hits, and blend statistics, which the ray tracers of Gaussians share.
 
 All floats are float64: a thin Gaussian far away leaves float32 no digit of its distance. P rays, N Gaussians, H hits.
 """
@@ -47,7 +47,7 @@ class Hits(NamedTuple):
 
 
 class BlendedRays(NamedTuple):
-    """The colours that rays see, and what their gradient needs."""
+    """The colours of rays, and the values that their gradient needs."""
 
     image: Floats
     """[P, 3] background included."""
@@ -69,7 +69,7 @@ class RayGradient(NamedTuple):
     means: Floats
     """[N, 3]."""
     shapes: Floats
-    """[N, ...] with respect to what the extension makes of quaternions and scales."""
+    """[N, ...] with respect to the shapes that the extension makes of quaternions and scales."""
     opacities: Floats
     """[N]."""
     colors: Floats
@@ -88,7 +88,7 @@ class Tracer(NamedTuple):
     list_hits: Callable[[Rays, Conventions], Hits]
     """``list_hits(rays, conventions)``: the blended hits of each ray."""
     blend: Callable[[Floats, Rays, Floats, Conventions], BlendedRays]
-    """``blend(colors, rays, background, conventions)``: what each ray sees."""
+    """``blend(colors, rays, background, conventions)``: the blended values of each ray."""
     blend_vjp: Callable[..., RayGradient]
     """``blend_vjp(colors, rays, background, conventions, blended, v_blended)``: the gradient of that, with derivatives
     with respect to the image [P, 3], the depths [P] and the transmittances [P]."""

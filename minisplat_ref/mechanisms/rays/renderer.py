@@ -1,6 +1,6 @@
-"""An image by rays through its pixels, and its gradient: what the renderers share that trace Gaussians of any kind.
+"""An image by rays through its pixels, and its gradient, for all renderers that trace Gaussians of any kind.
 
-A renderer is made of a :class:`Traced`: what becomes of a population before it is traced, and how that is traced.
+A renderer is made of a :class:`Traced`: the preparation of a population, and its tracer.
 """
 
 from collections.abc import Callable
@@ -34,9 +34,9 @@ class Traced(NamedTuple):
     """Of the extension."""
     prepare: Callable[[Any, Floats], Any]
     """``prepare(population, opacities)``: the Gaussians as rays meet them, of opacities [N] in float64, 0 where one is
-    not to be drawn."""
+    not rendered."""
     tracer_for: Callable[[Any, Conventions, Backend], Tracer]
-    """``tracer_for(prepared, conventions, backend)``: how a backend traces them; trees are built here."""
+    """``tracer_for(prepared, conventions, backend)``: the tracer of a backend; trees are built here."""
     shapes_vjp: Callable[[Any, Any, Floats], tuple[Floats, Floats]]
     """``shapes_vjp(population, prepared, v_shapes)``: the gradient with respect to quaternions [N, 4] and logarithms of
     scales [N, 3]."""
@@ -151,7 +151,7 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGr
 
 
 def _opacities(logits: Floats, is_visible: Bools | None) -> Floats:
-    """Return opacities [N] in float64, 0 where a Gaussian is not to be drawn."""
+    """Return opacities [N] in float64, 0 where a Gaussian is not rendered."""
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-logits.astype(np.float64)))
     return opacities if is_visible is None else np.where(is_visible, opacities, 0.0)

@@ -1,4 +1,4 @@
-"""What the gradient proof checks of a ray tracer: the renderer, with the thresholds that its rays cross."""
+"""Stages of a ray tracer for the gradient proof: the renderer, with the thresholds that its rays cross."""
 
 from collections.abc import Callable, Mapping
 

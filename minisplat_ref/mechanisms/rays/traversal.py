@@ -2,8 +2,8 @@
 
 Eight rays go together, as lanes: a box, or the contents of a leaf, is tested if any of them may meet it. Each keeps its
 own hits, sorted by t. Once those that a ray has found let less light through than it may end with, no hit beyond the
-last of them counts, and no box that begins there: this bound moves nearer as hits are found. It is exact, because what
-else lies in front can only dim the ray more.
+last of them counts, and no box that begins there: this bound moves nearer as hits are found. It is exact, because other
+primitives in front can only dim the ray more.
 """
 
 import functools
@@ -37,7 +37,7 @@ class Limits(NamedTuple):
 
 
 class RayTree(NamedTuple):
-    """What rays may meet, in the order of a tree's leaves: whole Gaussians, or parts of them such as triangles."""
+    """The primitives of a tree, in the order of its leaves: whole Gaussians, or parts of them such as triangles."""
 
     records: Floats
     """[N', C] of those that can be seen at all; the column ``OPACITY`` is the opacity."""

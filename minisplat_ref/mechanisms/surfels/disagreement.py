@@ -1,11 +1,11 @@
-"""How far the normals of surfels are from the surface through a depth map: 2D Gaussian Splatting, equation (14).
+"""The deviation of surfels' normals from the surface through a depth map: 2D Gaussian Splatting, equation (14).
 
 With the weights w_i and normals n_i of a pixel's hits, the opacity A, and the normal N of the surface through the
 neighbouring pixels' depths::
 
     L = mean over pixels of sum_i w_i (1 - <n_i, N>) = mean of A - <sum_i w_i n_i, N>
 
-Which depths these are, is the loss's own: expected, median or filtered.
+The loss chooses the depths: expected, median or filtered.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Surfels as what a recipe trains: their start, their renderer, and the density control of 2D Gaussian Splatting."""
+"""Surfels as a recipe's population: their start, their renderer, and the density control of 2D Gaussian Splatting."""
 
 from functools import partial
 

@@ -51,7 +51,7 @@ STEPS = Steps()
 
 
 class Asked(NamedTuple):
-    """What a call asks for beside the options of every call."""
+    """The request of a call besides the options of every call."""
 
     has_distortion: bool
     reads_median: bool
@@ -62,7 +62,7 @@ class Asked(NamedTuple):
 
 
 class OneView(NamedTuple):
-    """A view, and what its gradient needs."""
+    """A view, and the values that its gradient needs."""
 
     shown: Shown
     primitives: Primitives
@@ -105,7 +105,8 @@ def rasterization_2dgs(
     near_plane, far_plane, radius_clip, sh_degree, backgrounds, render_mode
         As there.
     tile_size : int
-        Side of gsplat's tiles, px; a surfel is drawn on all tiles that its radii reach, so it matters at their borders.
+        Side of gsplat's tiles, px; a surfel is rendered on all tiles that its radii reach, so it matters at their
+        borders.
     distloss : bool
         Whether to measure the distortion, for which a depth must be rendered.
     depth_mode : {"expected", "median"}
@@ -135,7 +136,7 @@ def rasterization_2dgs(
     Raises
     ------
     InputError
-        If an argument has a wrong shape, dtype or value, or asks for what is not computed.
+        If an argument has a wrong shape, dtype or value, or requests something that is not computed.
     """
     asked = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
     options = Options(sh_degree, render_mode, False, tile_size, radius_clip)
@@ -224,7 +225,7 @@ def _check(
     steps: Steps,
     others: dict[str, Any],
 ) -> Asked:
-    """Return what is asked for beside the options, checked.
+    """Return the request besides the options, checked.
 
     Raises
     ------

@@ -6,7 +6,7 @@ neighbouring pixels' depths::
     L_d = mean over pixels of sum_{i<j} w_i w_j (m_i - m_j)^2,   m = far / (far - near) (1 - near / z)
     L_n = mean over pixels of sum_i w_i (1 - <n_i, N>) = mean of A - <sum_i w_i n_i, N>
 
-The paper writes |m_i - m_j|; the square is what its code has. For L_n the code has ``1 - <sum_i w_i n_i, A N>`` with A
+The paper writes |m_i - m_j|; its code has the square. For L_n the code has ``1 - <sum_i w_i n_i, A N>`` with A
 held constant, which no finite difference can check; this is the paper's. With S_1 = sum w q and S_2 = sum w q^2, the
 renderer's channel ``spread``, the sum in L_d is ``b^2 (A S_2 - S_1^2)``, ``b = far near / (far - near)``, because m is
 ``const - b q``.

@@ -26,12 +26,12 @@ from minisplat_ref.reference.pinhole import pose, with_principal_point
 from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives, Projection
 
 LOW_PASS = 2.0  # px^-2: the low-pass is exp(-LOW_PASS |x - c|^2 / 2), a standard deviation of 0.71 pixels
-GSPLAT_CUTOFF = 3.33  # standard deviations to which gsplat draws a disc
+GSPLAT_CUTOFF = 3.33  # standard deviations to which gsplat renders a disc
 EXTENT_MIN = 1e-4  # px^2: least squared half-extent, gsplat's
 
 
 class SurfelRules(NamedTuple):
-    """What renderers of surfels do differently."""
+    """Differences between renderers of surfels."""
 
     has_hit_depths: bool
     """Whether the depth of a hit is that of the point hit, or that of the centre."""
@@ -49,7 +49,7 @@ GSPLAT = SurfelRules(has_hit_depths=False, drops_near_hits=False, tile_size=16)
 
 
 class Surfels(NamedTuple):
-    """What a camera sees of N surfels, in float64; zeros where culled."""
+    """N surfels projected by a camera, in float64; zeros where culled."""
 
     transforms: Floats
     """[N, 3, 3] T, whose rows are M_u, M_v and M_w."""

@@ -1,4 +1,4 @@
-"""What the order of the hits on a ray decides: the median depth, and the distortion as gsplat measures it.
+"""Quantities that depend on the order of the hits on a ray: the median depth, and gsplat's distortion.
 
 With the weights w_i and depths z_i of a pixel's hits, front to back, and ``T_i`` the transmittance in front of hit i::
 
@@ -23,7 +23,7 @@ from minisplat_ref.types import Floats, Ints, TileBins
 
 
 class RayMeasures(NamedTuple):
-    """Images of what lies along each ray."""
+    """Images of the measures along each ray."""
 
     median: Floats
     """[H, W] world units."""
@@ -43,7 +43,7 @@ def measure_rays(surfels: Surfels, bins: TileBins, conventions: Conventions) -> 
     Parameters
     ----------
     surfels : Surfels
-        N surfels. The depth of a hit is what its rules say.
+        N surfels. The depth of a hit follows its rules.
     bins : TileBins
         The surfels of each tile, nearest first.
     conventions : Conventions

@@ -1,4 +1,4 @@
-"""A renderer of surfels, and its gradient: colours, normals, depths and what distortion is made of as channels."""
+"""A renderer of surfels, and its gradient: colours, normals, depths and the terms of the distortion as channels."""
 
 from typing import Any, NamedTuple
 
@@ -54,7 +54,7 @@ class Shown(NamedTuple):
 
     surfels: Surfels
     colors: Floats
-    """[N, D] what is the same on a whole surfel; 0 in channels of depths."""
+    """[N, D] values that are constant on a surfel; 0 in channels of depths."""
     background: Floats
     """[D]."""
     bins: TileBins
@@ -63,7 +63,7 @@ class Shown(NamedTuple):
     layout: Layout
 
     def blend(self, with_stats: bool = False) -> RenderOutput:
-        """Return the image, blended by kernels or by the reference, and blend statistics if asked for."""
+        """Return the image, blended by kernels or by the reference, and blend statistics on request."""
         inputs = self.surfels, self.colors, self.background, self.bins, self.conventions
         if self.backend.is_compiled:
             response = response_for(self.colors.dtype, self.surfels, self.layout)
@@ -116,7 +116,7 @@ class Seen(NamedTuple):
 
 
 class BlendTape(NamedTuple):
-    """What :func:`blend` keeps for :func:`blend_vjp`."""
+    """The values that :func:`blend` keeps for :func:`blend_vjp`."""
 
     shown: Shown
     blended: RenderOutput
@@ -134,7 +134,7 @@ class BlendedGradient(NamedTuple):
 
 
 class SurfelTape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     seen: Seen
     sh_degree: int | Ints  # active
@@ -142,7 +142,7 @@ class SurfelTape(NamedTuple):
 
     @property
     def shown(self) -> Shown:
-        """What was blended."""
+        """The input of blending."""
         return self.blend.shown
 
 
@@ -162,7 +162,7 @@ def look(model: Model, view: View, request: Request) -> Seen:
     Raises
     ------
     InputError
-        Something is wanted that surfels do not have, or the conventions ask for compensated opacities.
+        Surfels lack a requested channel, or the conventions require compensated opacities.
     """
     if missing := request.wants - CHANNELS.keys() - EXTRAS:
         names = ", ".join(sorted(missing))

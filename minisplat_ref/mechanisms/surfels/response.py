@@ -1,4 +1,4 @@
-"""What a surfel does to a pixel: 2D Gaussian Splatting, equations (8) to (11), in NumPy.
+"""The response of a surfel in a pixel: 2D Gaussian Splatting, equations (8) to (11), in NumPy.
 
 The pixel (x, y) is where two planes of its ray meet the disc. In the coordinates (u, v, 1) of the disc they are::
 
@@ -21,7 +21,7 @@ from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.types import Bools, Floats, Ints
 
 FIELDS = ("transforms", "means2d", "opacities", "depths")
-"""What a hit has a derivative with respect to."""
+"""The inputs of a hit that have derivatives."""
 
 
 class Layout(NamedTuple):
@@ -36,7 +36,7 @@ class Layout(NamedTuple):
 
 
 class SurfelPlace(NamedTuple):
-    """Where P rays hit G surfels."""
+    """The places where P rays hit G surfels."""
 
     u: Floats  # [G, P] 0 where the low-pass is hit
     v: Floats  # [G, P]
@@ -100,7 +100,7 @@ def hit_vjp(
     found : Hit
         Its result.
     v_mean, v_shape : ndarray of shape (G, P)
-        ``v_alpha``, as for every response; what moves a surfel also shapes it here, so ``v_mean`` serves both.
+        ``v_alpha``, as for every response; the same parameters move and shape a surfel, so ``v_mean`` serves both.
     v_depths : ndarray of shape (G, P), optional
         v_z, of the depths of the hits.
 

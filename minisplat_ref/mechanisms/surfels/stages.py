@@ -1,4 +1,4 @@
-"""The stages of the gradient check of a representation of surfels: all channels, and what is measured along rays."""
+"""The stages of the gradient check of a representation of surfels: all channels, and the measures along rays."""
 
 import numpy as np
 

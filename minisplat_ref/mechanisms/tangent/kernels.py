@@ -6,7 +6,8 @@ third are the whitened coordinates u on the tangent plane, with ``K = A^T A``::
     u_k = (a_k . d) / (n . d),   alpha = o exp(-(u_1^2 + u_2^2) / 2)
 
 Each plane is stored by its value at a pixel of the footprint's box and its slopes along x and y, so that differences of
-large numbers are taken in float64, before a float32 kernel begins. The three planes M d of the depth are stored alike.
+large numbers are taken in float64, before a float32 kernel begins. The three planes M d of the depth are stored in the
+same way.
 """
 
 import functools

@@ -104,7 +104,7 @@ def project(primitives: Primitives, camera: Camera, conventions: Conventions) ->
     Raises
     ------
     InputError
-        The conventions ask for compensated opacities.
+        The conventions require compensated opacities.
     """
     if conventions.is_antialiased:
         raise InputError("tangent planes have no compensated opacities: leave the antialiased profile out")

@@ -1,4 +1,4 @@
-"""Colours on given rays instead of pixels, for studies that turn or move a camera and look again."""
+"""Colours on given rays instead of pixels, for studies that turn or move a camera."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -125,15 +125,15 @@ def orbit_camera(camera: Camera, angle: float, center: Floats) -> Camera:
 
 
 class Changes(NamedTuple):
-    """How much the colours of P rays change along a path of n cameras; the channel that changes most counts."""
+    """The change of the colours of P rays along a path of n cameras; the channel that changes most counts."""
 
     largest: Floats
     """[n - 1] of the rays, in each step."""
     mean: Floats
     """[n - 1] over the rays, in each step."""
     flicker: float
-    """What the changes themselves change by from step to step, summed over the path, as a mean over the rays: a colour
-    that changes evenly has none, however far it goes, and each jump counts twice."""
+    """The change of the changes from step to step, summed over the path, as a mean over the rays: it is 0 for a colour
+    that changes evenly, however far, and each jump counts twice."""
 
 
 def color_changes(
@@ -144,7 +144,7 @@ def color_changes(
     rays: Sequence[Floats],
     conventions: Conventions,
 ) -> Changes:
-    """Return how much the colours of rays change along a path.
+    """Return the change of the colours of rays along a path.
 
     Parameters
     ----------

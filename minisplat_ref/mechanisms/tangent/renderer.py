@@ -38,7 +38,7 @@ from minisplat_ref.types import (
 
 BUFFER_MAX = 1024  # hits; for more, use None
 OF_STATS = frozenset({"stats", "surface", "dominant_depth"})
-"""What needs blend statistics."""
+"""The outputs that need blend statistics."""
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
 """The response of the reference, in the order of the list unless ``buffer_size`` is set."""
@@ -52,7 +52,7 @@ class Prepared(NamedTuple):
     primitives: Primitives
     view_camera: Camera
     footprints: TangentFootprints
-    channels: Floats  # [N, D] colours, then the depth if asked for
+    channels: Floats  # [N, D] colours, then the depth on request
     background: Floats  # [D]
     has_depth: bool
     conventions: Conventions
@@ -68,7 +68,7 @@ class Prepared(NamedTuple):
         return REFERENCE.bin_gaussians(by_distance, grid, self.conventions)
 
     def blended(self, bins: TileBins, wants: frozenset[str] = frozenset()) -> RenderOutput:
-        """Return the image, drawn by kernels or by the reference, and the statistics that are wanted."""
+        """Return the image, rendered by kernels or by the reference, and the requested statistics."""
         inputs = self.footprints, self.channels, self.background, bins, self.conventions
         blend = (
             partial(kernel_hits.composite_hits, response_for(self.channels.dtype, self.buffer_size))
@@ -88,7 +88,7 @@ class Prepared(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render` keeps for :func:`render_vjp`."""
 
     prepared: Prepared
     bins: TileBins
@@ -101,7 +101,7 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
     Raises
     ------
     InputError
-        The size of the buffer is out of range, or the conventions ask for compensated opacities.
+        The size of the buffer is out of range, or the conventions require compensated opacities.
     """
     g, backend = model.gaussians, request.backend
     size = check_buffer_size(buffer_size)
@@ -174,7 +174,7 @@ def render(model: Model, view: View, request: Request, *, buffer_size: int | Non
 
 
 def _extras(p: Prepared, bins: TileBins, output: RenderOutput, request: Request) -> dict[str, Any]:
-    """Return what the request wants by name besides channels and statistics."""
+    """Return the outputs that the request names besides channels and statistics."""
     extras: dict[str, Any] = {}
     if output.stats is not None:
         dominant_ids = output.stats.dominant_ids

@@ -21,7 +21,7 @@ def renderer_stage(
     buffer_size: int | None,
     rng: np.random.Generator,
 ) -> Stage:
-    """Return the renderer as a stage whose points record what is listed, blended and clamped, and in which order.
+    """Return the renderer as a stage whose points record the hits that are listed, blended and clamped, in their order.
 
     The reference computes these records again, so that the check notices a step across a threshold.
     """

@@ -1,12 +1,12 @@
 """``adaptive``: the scene decides how many Gaussians it needs and when training ends.
 
-No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence for each rule, and what was tried
-without success. There is no schedule, and no setting depends on the scene:
+No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence for each rule, and the failed attempts.
+There is no schedule, and no setting depends on the scene:
 
 *Grow.* Every 100 iterations the Gaussians whose mean screen gradient reaches a threshold are halved
-(:mod:`minisplat_ref.strategy.halving`), at most a fifth of all at a time; those come first that are responsible for
-most of the images' error (:mod:`minisplat_ref.strategy.error_weights`). A Gaussian that fits what it covers has a small
-gradient, so growth fades where a scene has enough.
+(:mod:`minisplat_ref.strategy.halving`), at most a fifth of all at a time; first those that are responsible for most of
+the images' error (:mod:`minisplat_ref.strategy.error_weights`). A Gaussian that fits the pixels that it covers has a
+small gradient, so growth fades where a scene has enough.
 
 *View dependence.* Each Gaussian has as many degrees of the harmonics as the views that show it determine.
 
@@ -17,29 +17,29 @@ the work, in pairs (tile, Gaussian), is the slope of a line through the measurem
 at twice the size; when they are as they were taken, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
 
-*Ask the photographs.* A sky, exposures, refined poses and compensated opacities are each switched on once, and only if
-one half of the photographs, or of each photograph, shows the other half what it gains by them.
+*Calibrate.* A sky, exposures, refined poses and compensated opacities are each switched on once, and only if parameters
+fitted to one half of the photographs, or of each photograph, improve the other half.
 
 *Begin densely.* Stereo adds surface points where structure from motion has found few
 (:mod:`minisplat_ref.training.dense_start`).
 
 *Look through.* Gaussians that lie before sparse points which photographs show are removed every 100 iterations.
 
-*Prune.* While the rates fall, what the photographs would hardly miss is removed in slices.
+*Prune.* While the rates fall, Gaussians that the photographs would hardly miss are removed in slices.
 
 ================  ==================================================================================================
-``recipe``        the recipe: which rule acts when
+``recipe``        the recipe: the schedule of the rules
 ``numbers``       all numbers, each with its unit and its reason
 ``growth``        which Gaussians are halved
-``degrees``       how many degrees of the harmonics each Gaussian has
-``progress``      what the held-out views gain, and what follows: larger views, or the end
-``switches``      what is switched on if the photographs need it: the rule, and the table
-``evidence``      whether parameters that are fitted to one half of each photograph explain the other
+``degrees``       the degree of the harmonics of each Gaussian
+``progress``      the gain of the held-out views, and its consequence: larger views, or the end
+``switches``      calibrations that are switched on if the photographs need them: the rule, and the table
+``evidence``      parameters that are fitted to one half of each photograph and judged on the other
 ``exposure``      the exposure of each photograph
 ``pose``          the pose of each photograph
 ``antialiasing``  compensated opacities, where photographs differ in resolution
 ``sky``           a sky behind the scene
 ``veils``         Gaussians before sparse points that photographs show, which are removed
-``prune``         what is removed while the rates fall
+``prune``         removal of Gaussians while the rates fall
 ================  ==================================================================================================
 """

@@ -1,10 +1,10 @@
 """Compensated opacities, which ``adaptive`` switches on where photographs differ in resolution.
 
-What the compensation would do to a photograph is a field, b = compensated rendering - rendering, and its amount x is
+The effect of the compensation on a photograph is a field, b = compensated rendering - rendering, and its amount x is
 fitted to each half of each photograph and judged on the other (:mod:`minisplat_ref.methods.adaptive.evidence`). Where
-all photographs show things at the same size, the Gaussians have learned what the low-pass adds, and no photograph wants
-another x than the mean. Where some show them smaller, by their own size or from afar, those want more of it, and the
-others less: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`).
+all photographs show things at the same size, the Gaussians have been trained with the low-pass, and x is the same for
+all photographs. Where some show them smaller, by their resolution or from afar, x is larger for those than for the
+others: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`).
 """
 
 from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, halves_of, pairs, render_clipped, weigh

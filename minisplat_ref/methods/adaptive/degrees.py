@@ -1,4 +1,4 @@
-"""View dependence where it pays: each Gaussian of ``adaptive`` has a degree of the spherical harmonics for itself.
+"""View dependence where it pays: each Gaussian of ``adaptive`` has an individual degree of the spherical harmonics.
 
 Colours of degree d have (d + 1)^2 coefficients, and every photograph that shows a Gaussian is one observation of its
 colour. With about as many coefficients as photographs, the harmonics pass through all of them and are wrong between:
@@ -13,8 +13,8 @@ directions from which the Gaussian has been seen is removed, from the highest do
 
     variation_l = sqrt( mean over v and colours of (c_l(d_v) - mean c_l)^2 )
 
-and the mean, which does not depend on the view, goes to the coefficient of degree 0: ``k_00 += mean c_l / Y_00``. What
-hardly shows in photographs is not worth its numbers.
+and the mean, which does not depend on the view, goes to the coefficient of degree 0: ``k_00 += mean c_l / Y_00``. A
+degree that is hardly visible in photographs is not worth its parameters.
 
 Absent degrees are zeros in ``sh_rest``, which every viewer of PLY files understands; neither colours nor Adam compute
 with them (``stats["sh_degree"]`` is the degree of each Gaussian).
@@ -111,7 +111,7 @@ def cut_degrees_when_cooling(state: TrainState, iteration: Iteration, *, min_var
 
 
 def describe_degrees(state: TrainState) -> str:
-    """Return how many Gaussians have each degree, and how many coefficients of colour each has on average."""
+    """Return the number of Gaussians of each degree, and the mean number of colour coefficients."""
     degrees = state.stats[DEGREES]
     shares = np.bincount(degrees, minlength=SH_DEGREE_MAX + 1) / max(len(degrees), 1)
     mean = 3 * (1 + n_coefficients(degrees)).sum() / max(len(degrees), 1)
@@ -146,7 +146,7 @@ def without_idle_degrees(
         New coefficients of colour, the other fields as they were. The mean of what was removed, over the seen
         directions, is in ``sh_dc``.
     degrees : ndarray of shape (N,) of uint8
-        What is left.
+        The remaining degrees.
     """
     sh_dc, sh_rest, degrees = gaussians.sh_dc.copy(), gaussians.sh_rest.copy(), degrees.copy()
     means, deviations = _variations(gaussians, int(degrees.max(initial=0)), views, is_seen)

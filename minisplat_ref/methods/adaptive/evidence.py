@@ -1,4 +1,4 @@
-"""Whether photographs need a calibration: parameters fitted to one half of each have to explain the other half.
+"""Evidence that photographs need a calibration: parameters fitted to one half of each have to explain the other half.
 
 After a few hundred iterations a scene is a blur in the right place. To first order, a calibration explains the residual
 r = photograph - rendering by a few fields b_k, ``r = sum_k x_k b_k``:
@@ -8,15 +8,15 @@ r = photograph - rendering by a few fields b_k, ``r = sum_k x_k b_k``:
   rendering, b = (d/du, d/dv) rendering.
 
 The x of a photograph are fitted to its left half by least squares and judged on its right half, and vice versa. Noise
-and what the scene has not learned yet differ from half to half, and worsen the other half; an exposure and a pose are
+and the remaining errors of the scene differ from half to half, and worsen the other half; an exposure and a pose are
 the same in both, and improve it. The x that explains all photographs together best belongs to the scene and not to
-them; it is what the comparison starts from:
+them; the comparison starts from it:
 
     gain of a photograph = 10 log10 (before / after)
     before = sum over halves |r - common x b|^2,   after = sum over halves |r - (x of the other half) b|^2
 
 It is in decibels of the squared error. It supports the calibration if its mean over the photographs is above both a
-least gain and its standard error. One suffices: gains differ much between photographs, and there are few of these.
+minimum gain and its standard error. One suffices: gains differ much between photographs, and there are few of these.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +50,7 @@ class Half(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What the photographs say about a calibration."""
+    """The evidence of the photographs about a calibration."""
 
     gain: float
     """dB of the squared error, mean over the photographs."""
@@ -62,7 +62,7 @@ class Evidence(NamedTuple):
     def describe(
         self, what: str, fitted_to: str = "one half of each photograph", judged_by: str = "the other half"
     ) -> str:
-        """Say in a sentence without an end what a calibration, fitted to one part, does to another."""
+        """Describe the effect on one part of a calibration that was fitted to another, without a full stop."""
         verb = "improves" if what.startswith("a ") else "improve"
         if self.gain < 0:
             verb = verb.replace("improve", "worsen")
@@ -79,7 +79,7 @@ class Evidence(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What the photographs answer when they are asked whether they need a calibration."""
+    """The decision about a calibration, and its evidence."""
 
     evidence: Evidence
     why: str
@@ -145,7 +145,7 @@ class Pair(NamedTuple):
 
 
 def pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Iterator[Pair]:
-    """Iterate over training views beside what the scene shows of them."""
+    """Iterate over pairs of a training view and its rendering."""
     request = iteration.render_settings.request()
     for index in view_ids:
         view = iteration.scene.train_views[index].load()

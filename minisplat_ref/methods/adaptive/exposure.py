@@ -1,4 +1,4 @@
-"""Exposure of each photograph, which ``adaptive`` switches on where the photographs show that they need it.
+"""Exposure of each photograph, which ``adaptive`` switches on where the photographs are evidence for it.
 
 After a few hundred iterations the scene is a blur of the right brightness. If the gain of one half of a photograph
 explains the other half (:mod:`minisplat_ref.methods.adaptive.evidence`), the camera has changed its exposure, unless
@@ -53,7 +53,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
 
 
 def ask_about_exposures(state: TrainState, iteration: Iteration) -> Answer:
-    """Return whether halves of photographs explain each other by gains; exposures begin with these."""
+    """Return whether gains fitted to one half of each photograph explain the other; exposures begin with these."""
     n_views = len(iteration.scene.train_views)
     ids = trained_ids(n_views, iteration.cooling, state.pace)
     evidence = exposure_evidence(state, iteration, ids)

@@ -1,4 +1,4 @@
-"""How ``adaptive`` grows: Gaussians whose screen gradient is large are halved, those behind most of the error first."""
+"""Growth of ``adaptive``: Gaussians whose screen gradient is large are halved, those behind most of the error first."""
 
 import math
 
@@ -40,14 +40,14 @@ def grow(
     state, iteration
         As for every action.
     threshold : float
-        Least mean length of the screen gradient, in normalised device coordinates.
+        Minimum of the mean length of the screen gradient, in normalised device coordinates.
     max_growth : float
         At most this fraction of the Gaussians is halved, those behind most of the images' error.
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
     error_views : int
-        At most this many of the views that are trained on, evenly spread, are rendered to say where the error is; with
-        0 the gradients decide which come first.
+        At most this many of the views that are trained on, evenly spread, are rendered to locate the error; with 0 the
+        gradients decide which come first.
     budget : int, optional
         Largest number of Gaussians to grow to; the training may begin with more.
     """

@@ -1,4 +1,4 @@
-"""All numbers of ``adaptive``: what each is, its unit, and the reason for its value as far as one is recorded.
+"""All numbers of ``adaptive``, each with its meaning, its unit, and the reason for its value as far as one is recorded.
 
 Letters name the sections of ``docs/measured/adaptive.md``. ``--set`` reaches those that an action takes as a setting.
 Two numbers are shared with others: how far halves are apart (:data:`minisplat_ref.strategy.halving.OFFSET`), and the
@@ -39,8 +39,8 @@ recorded for 24."""
 VIEWS_PER_COEFFICIENT = 1.5
 """Training views for each coefficient of a channel of the colour. Fewer are a matter of taste (G)."""
 VARIATION_MIN = 4 / 255
-"""Standard deviation of a degree's part of the colour, out of 1, below which the degree is removed: what hardly shows
-in photographs is not worth its numbers. Without this rule the room has 309,102 numbers, not 224,855, and 27.57 dB,
+"""Standard deviation of a degree's part of the colour, out of 1, below which the degree is removed: a degree that is
+hardly visible is not worth its parameters. Without this rule the room has 309,102 numbers, not 224,855, and 27.57 dB,
 not 27.59 (B)."""
 
 # --- measurement, the next size, and the end ---
@@ -65,18 +65,18 @@ room loses 0.2 dB (B)."""
 COOLING_LAST, COOLING_LAST_PER_EXTENT = 0.1, 0.01
 """Factors of the rates at the end of the cool-down, and of those per unit of the extent. No reason recorded."""
 
-# --- what the photographs need ---
+# --- calibrations ---
 
 SKY_STEP = 100
-"""Iteration in which a sky is asked about. No reason recorded for 100; large Gaussians have covered it by then
+"""Iteration in which a sky is considered. No reason recorded for 100; large Gaussians have covered it by then
 (H)."""
 EXPOSURE_STEP = 600
-"""Iteration in which exposures are asked about: after a few hundred, the scene is a blur of the right brightness."""
+"""Iteration in which exposures are considered: after a few hundred, the scene is a blur of the right brightness."""
 ANTIALIASING_STEP = 650
-"""Iteration in which anti-aliasing is asked about, before poses: asked after them, it found poses on in half of the
-trials with two sizes on the room, wrongly (D)."""
+"""Iteration in which anti-aliasing is considered, before poses: in the other order, poses were wrongly on in half of
+the trials with two sizes on the room (D)."""
 POSE_STEP = 700
-"""Iteration in which poses are asked about, after anti-aliasing."""
+"""Iteration in which poses are considered, after anti-aliasing."""
 GAIN_MIN = 0.1
 """dB of the squared error for which a calibration is worthwhile. With 0.05 dB exposures came on in some trials of
 brighton_beach, and cost 1.2 dB (D)."""
@@ -86,13 +86,13 @@ where eleven photographs provide the evidence (D)."""
 RIDGE = 1e-3
 """Of the mean square of a field over the halves: where next to nothing is rendered, x would be arbitrary."""
 DARK, BRIGHT = 0.05, 0.98
-"""Brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation."""
+"""Brightness, out of 1, beyond which pixels carry no information about a gain: noise, saturation."""
 
 # --- a sky ---
 
 SKY_GAIN_MIN = 2.0
 """dB of the squared error, where a sky shows: it explains nearly all that is there. Skies explain 2.7 dB and more,
-what is none 1.2 or less (H)."""
+other backgrounds 1.2 or less (H)."""
 SKY_N_ERRORS = 3.0
 """Standard errors that the gain of a sky must exceed: nearly all photographs gain by it, because they see one sky."""
 LARGE, HUGE = 0.25, 1.0
@@ -105,9 +105,9 @@ SKY_VIEWS_MAX = 24
 SKY_VIEWS_MIN = 4
 """Photographs that must show something behind the scene: two to fit, two to judge."""
 OPEN = 0.5
-"""Transmittance above which a pixel shows what is behind the scene. No reason recorded."""
+"""Transmittance above which a pixel shows the background. No reason recorded."""
 OPEN_MIN = 0.005
-"""Fraction of a photograph's pixels that must be open: fewer say nothing."""
+"""Fraction of a photograph's pixels that must be open: fewer are no evidence."""
 
 # --- veils ---
 
@@ -128,13 +128,14 @@ SEEN_BY_MIN = 2
 """Views that must see a Gaussian when the rates begin to fall. No reason recorded."""
 REMOVAL_SLOPE_MIN = 1.0
 """Relative rise of the squared error over the relative fall of the count, from which a Gaussian stays: 3 dB for each
-doubling of the count, before the others learn to replace it. Less keeps more Gaussians for under 0.1 dB (C)."""
+doubling of the count, before training adapts the others to replace it. Less keeps more Gaussians for under 0.1 dB
+(C)."""
 PRUNED_MAX = 0.2
 """Fraction of the Gaussians in a slice, at most. No reason recorded."""
 PSNR_COST_MAX, SSIM_COST_MAX = 0.1, 0.005
 """dB and SSIM that the prune may cost on held-out training views, in all slices together (L)."""
 COST_RISE = 2.0
-"""What a slice is taken to cost, as a multiple of the one before: each comes from Gaussians that matter more. With 1,
+"""Assumed cost of a slice, as a multiple of the one before: each slice removes more important Gaussians. With 1,
 the last slice of the room cost 0.24 dB (L)."""
 N_SLICES = 8
 """Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
@@ -143,6 +144,6 @@ LAST_SLICE = 0.64
 """Part of the cool-down after which no slice comes, so that it can converge. Later slices were tried and are no
 better (C)."""
 GAP_MIN = 20
-"""Iterations from slice to slice, in which the others learn to replace what is gone."""
+"""Iterations from slice to slice, in which training adapts the others to replace what is gone."""
 SLICE_MIN = 0.01
 """Fraction of the Gaussians; a smaller slice is not worth a disturbance."""

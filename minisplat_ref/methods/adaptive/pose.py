@@ -29,7 +29,7 @@ def rotation_of(camera: Camera, displacement: Floats) -> Floats:
 
 
 def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
-    """Return whether halves of photographs explain each other by displacements; poses begin with these."""
+    """Return whether displacements fitted to one half of each photograph explain the other; poses begin with these."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     evidence = pose_evidence(state, iteration, ids)
@@ -45,7 +45,7 @@ def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
 
 
 def turn_held_out(state: TrainState, iteration: Iteration) -> str | None:
-    """Turn the held-out training views so that they show what the scene shows, if poses are refined."""
+    """Align the cameras of the held-out training views with the scene, if poses are refined."""
     if ROTATIONS not in state.shared or iteration.cooling is None or not state.pace.holds_out:
         return "nothing done: no poses are refined"
     views = iteration.scene.train_views

@@ -1,4 +1,4 @@
-"""How ``adaptive`` measures its progress on held-out views, and continues to larger views or to the cool-down."""
+"""Progress of ``adaptive`` on held-out views, after which it continues with larger views or with the cool-down."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
 def evaluate_held_out(
     state: TrainState, iteration: Iteration, cooling: Cooling, *, has_ssim: bool = False
 ) -> Measurement:
-    """Return the PSNR of the held-out training views, and the SSIM if it is asked for."""
+    """Return the PSNR of the held-out training views, and the SSIM on request."""
     views = iteration.scene.train_views
     ids, psnrs, ssims = held_out_ids(len(views), cooling.hold_out_every), [], []
     # Their exposures are not trained and must not enter the measurement. For poses, see turn_held_out.
@@ -43,7 +43,7 @@ def proceed_when_little_is_gained(
 ) -> str | None:
     """Continue to larger views, or to the cool-down, when held-out views gain too little for each doubling of the work.
 
-    What counts is what was measured since half of the work, and since anything was last decided.
+    Only values since half of the work, and since the latest decision, count.
 
     Parameters
     ----------

@@ -1,14 +1,14 @@
-"""How ``adaptive`` prunes: in slices, while the rates fall, what the photographs would hardly miss.
+"""Pruning of ``adaptive``: in slices, while the rates fall, Gaussians that the photographs would hardly miss.
 
-The error falls because the rates do. What most Gaussians add to the images is then known:
+The error falls because the rates do. The contribution of most Gaussians to the images is then known:
 :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each of them, in one pass over
-the training views. Those that are not worth their place go, a slice at a time; after each slice the training repairs
-what it can, and the changes are recomputed.
+the training views. Those that are not worth their place are removed, a slice at a time; after each slice the training
+repairs what it can, and the changes are recomputed.
 
-What that costs is measured, too, on the training views that are held out: before each slice their PSNR and SSIM are
+The cost is measured, too, on the training views that are held out: before each slice their PSNR and SSIM are
 compared with the best so far. When the next slice would cost more than a tenth of a decibel, or five thousandths of
-SSIM, in all, the prune ends. So it does where no slice is due anymore: at the end of the cool-down nothing is removed,
-and all photographs are trained on, so that it can converge.
+SSIM, in all, the prune ends. It also ends where no further slice is due: at the end of the cool-down nothing is
+removed, and all photographs are trained on, so that it can converge.
 """
 
 from collections.abc import Sequence
@@ -57,8 +57,8 @@ def prune_in_slices(
     min_views : int
         Those that are visible in fewer views are removed before the first slice, however much they change there.
     min_slope : float
-        Those stay whose removal raises the squared error by at least this many times what the count falls by, both
-        relative: 1.0 is 3 dB for each doubling, before the others learn to replace them.
+        Those stay whose removal raises the squared error by at least this many times the fall of the count, both
+        relative: 1.0 is 3 dB for each doubling, before training adapts the others to replace them.
     max_pruned : float
         A slice is at most this fraction of the Gaussians.
     max_psnr_cost, max_ssim_cost : float
@@ -110,10 +110,10 @@ def is_over(pace: Pace, step: int) -> bool:
 
 
 def foreseen_costs(before_slices: Sequence[Measurement]) -> tuple[float, float]:
-    """Return what the prune will have cost after one more slice: PSNR in dB, and SSIM.
+    """Return the estimated cost of the prune after one more slice: PSNR in dB, and SSIM.
 
-    The cost so far is the best value less the present one; one more slice is taken to cost ``COST_RISE`` times what the
-    last one did. Before the first slice both are 0.
+    The cost so far is the best value less the present one; one more slice is assumed to cost ``COST_RISE`` times as
+    much as the last one. Before the first slice both are 0.
     """
     costs = []
     for values in ([m.psnr for m in before_slices], [m.ssim for m in before_slices]):

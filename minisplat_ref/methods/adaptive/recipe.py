@@ -1,4 +1,4 @@
-"""The recipe ``adaptive``: which rule acts when. Its numbers are in :mod:`minisplat_ref.methods.adaptive.numbers`."""
+"""The recipe ``adaptive``: the schedule of its rules, with numbers of :mod:`minisplat_ref.methods.adaptive.numbers`."""
 
 from functools import partial
 

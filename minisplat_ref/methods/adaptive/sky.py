@@ -1,11 +1,12 @@
 """A sky, which ``adaptive`` gives to scenes whose photographs show one.
 
 Structure from motion finds no points in a sky, and training covers it with the Gaussians of the horizon, which it makes
-large: after a hundred iterations hardly any pixel is transparent. So the question is not what shows through, but what
-would do better. The larger a Gaussian is beside the path of the cameras, the more it looks the same from all of them,
-as a sky does. The large Gaussians are taken away, and the harmonics of a sky (:mod:`minisplat_ref.training.sky`) are
-fitted to what is then missing, r = photograph - rendering, by least squares over half of the photographs, and there
-over the pixels that the rest of the scene lets more than half of the light through to:
+large: after a hundred iterations hardly any pixel is transparent. So the test is not whether the background shows
+through, but whether a sky explains the photographs better. The larger a Gaussian is relative to the path of the
+cameras, the more it looks the same from all of them, as a sky does. The large Gaussians are taken away, and the
+harmonics of a sky (:mod:`minisplat_ref.training.sky`) are fitted to the residual, r = photograph - rendering, by least
+squares over half of the photographs, and there over the pixels that the rest of the scene lets more than half of the
+light through to:
 
     r = sum_k s_k b_k,   b_k = T Y_k        T: transmittance, Y_k: spherical harmonics in the direction of the pixel
 
@@ -17,8 +18,8 @@ sky.
 
 Other pixels would drown it, because of all that the scene has not learned yet. A wall that is all of one colour is no
 sky: its photographs disagree about the direction in which its edges lie. All photographs see one sky, so nearly all of
-them gain by whatever it explains, and a sky explains nearly all of what it shows; so the mean gain has to exceed 2 dB,
-and three standard errors, where a calibration that each photograph has for itself needs one.
+them gain by it, and a sky explains nearly all of its pixels; so the mean gain has to exceed 2 dB, and three standard
+errors, where a calibration with parameters for each photograph needs one.
 
 If the sky is better, it is fitted to all pixels of all photographs, and only the largest of these Gaussians are
 removed, those that are larger than the path of the cameras itself. Others show a part of the scene besides, such as the
@@ -73,7 +74,7 @@ def behind(residual: Floats, transmittance: Floats, basis: Floats) -> Behind:
 
 
 def fit_sky(photographs: Sequence[Behind]) -> Floats:
-    """Return the coefficients [16, 3] that explain photographs best, drawn a little towards zero."""
+    """Return the coefficients [16, 3] that explain photographs best, with a slight shrinkage towards zero."""
     normal = np.sum([photograph.normal for photograph in photographs], axis=0)
     projected = np.sum([photograph.projected for photograph in photographs], axis=0)
     ridge = max(SKY_RIDGE * np.trace(normal) / N_BASIS, np.finfo(float).tiny)
@@ -81,13 +82,13 @@ def fit_sky(photographs: Sequence[Behind]) -> Floats:
 
 
 def cross_validate(photographs: Sequence[Behind]) -> Floats:
-    """Return what is left of each photograph [V] by a sky that was fitted to every second one, not to itself."""
+    """Return the residual of each photograph [V] with a sky that was fitted to every second one, not to itself."""
     skies = [fit_sky(photographs[1 - parity :: 2]) for parity in (0, 1)]
     return np.array([photograph.squared_residual(skies[k % 2]) for k, photograph in enumerate(photographs)])
 
 
 def compare(as_it_is: Sequence[Behind], without_large: Sequence[Behind]) -> Evidence:
-    """Return what at least two photographs say about a sky in place of the large Gaussians; ``fitted`` is its s_k."""
+    """Return the evidence of two photographs or more for a sky instead of large Gaussians; ``fitted`` is its s_k."""
     before, after = cross_validate(as_it_is), cross_validate(without_large)
     gains = [10.0 * np.log10(b / a) if a > 0 and b > 0 else 0.0 for a, b in zip(after, before, strict=True)]
     error = np.std(gains, ddof=1) / np.sqrt(len(gains))
@@ -110,7 +111,7 @@ def find_counted_pixels(iteration: Iteration, view_ids: Sequence[int]) -> dict[i
 
 
 def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int], is_drawn: Bools) -> dict[int, Ints]:
-    """Return those of the pixels that show what is behind the Gaussians ``is_drawn`` [N].
+    """Return those of the pixels that show the background behind the Gaussians ``is_drawn`` [N].
 
     Views with too few such pixels are left out.
     """
@@ -143,7 +144,7 @@ def photographs_behind(
 
 
 def ask_about_a_sky(state: TrainState, iteration: Iteration) -> Answer | str:
-    """Return whether photographs explain each other better by a sky in place of the large Gaussians.
+    """Return whether a sky instead of the large Gaussians, fitted to some photographs, explains the others better.
 
     It begins with the fit to all pixels, and the largest of these Gaussians go.
     """

@@ -1,7 +1,7 @@
-"""What ``adaptive`` switches on, and the rule by which it does: one function, and a table.
+"""The calibrations that ``adaptive`` switches on, and the rule for it: one function, and a table.
 
-Each calibration (:mod:`minisplat_ref.training.calibration`) is asked about once, in one iteration. It is switched on if
-what the photographs gain by it is above a minimum gain and above a number of standard errors
+Each calibration (:mod:`minisplat_ref.training.calibration`) is examined once, in one iteration. It is switched on if
+the photographs' gain by it is above a minimum gain and above a number of standard errors
 (:mod:`minisplat_ref.methods.adaptive.evidence`), unless a rival explains more.
 """
 
@@ -29,9 +29,9 @@ class Switch:
     decision: str
     """Its name in the record of decisions."""
     already: str
-    """What to say where it is on."""
+    """The message where it is on."""
     ask: Callable[[TrainState, Iteration], Answer | str]
-    """Asks the photographs; returns a text where there is nothing to ask."""
+    """Examines the photographs; returns a text where there is nothing to examine."""
     n_errors: float = N_ERRORS
     """Standard errors that the gain must exceed."""
     rival: "Switch | None" = None
@@ -43,7 +43,7 @@ class Switch:
         return f"switch_{self.calibration.name}_on"
 
     def __call__(self, state: TrainState, iteration: Iteration, **min_gains: float) -> str | None:
-        """Switch the calibration on, or say why not.
+        """Switch the calibration on, or report the reason against it.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Switch:
         return answer.why
 
     def _supported(self, state: TrainState, iteration: Iteration, min_gains: Mapping[str, float]) -> Answer | str:
-        """Return the photographs' answer if it supports the calibration, and otherwise why nothing is to be done."""
+        """Return the photographs' evidence if it supports the calibration, and otherwise the reason against it."""
         if self.calibration.initial(1).keys() <= state.shared.keys():
             return self.already
         answer = self.ask(state, iteration)
@@ -113,4 +113,4 @@ SWITCHES = {
     switch.calibration.name: switch
     for switch in (switch_sky_on, switch_exposure_on, switch_antialiasing_on, switch_pose_on)
 }
-"""By the name of the calibration, in the order in which they are asked about."""
+"""By the name of the calibration, in the order in which they are examined."""

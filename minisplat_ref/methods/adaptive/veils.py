@@ -1,10 +1,11 @@
-"""How ``adaptive`` removes veils: Gaussians that lie before sparse points which photographs show.
+"""Removal of veils by ``adaptive``: Gaussians that lie in front of sparse points which photographs show.
 
-A photograph shows a sparse point, so nothing opaque lies between. A Gaussian may be blended there all the same, because
-it makes that photograph right where its depth does not matter; any other camera sees it as fog. What it costs cannot be
-seen in the photographs that are trained on, and its opacity gets no gradient that would remove it. So
-:mod:`minisplat_ref.strategy.line_of_sight` says which part of what a Gaussian adds to the rays of sparse points lies
-before these points, and those with a large part are removed. Gaussians on no such ray are not judged.
+Where a photograph shows a sparse point, nothing opaque lies between the camera and the point. A Gaussian may be blended
+there all the same, because it makes that photograph right where its depth does not matter; any other camera sees it as
+fog. Its error is invisible in the training photographs, and its opacity gets no gradient that would remove it. So
+:mod:`minisplat_ref.strategy.line_of_sight` computes which part of a Gaussian's contribution to the rays of sparse
+points lies in front of these points, and Gaussians with a large part are removed. Gaussians on no such ray are not
+judged.
 """
 
 from typing import Any
@@ -46,7 +47,8 @@ def remove_veils(
 def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:
     """Return the weight of each Gaussian [N] on the rays of sparse points: before the points, and altogether.
 
-    It looks at :data:`VEIL_VIEWS_MAX` training views and :data:`VEIL_RAYS_MAX` rays of each at most, others each time.
+    It examines at most :data:`VEIL_VIEWS_MAX` training views and :data:`VEIL_RAYS_MAX` rays of each, different ones
+    each time.
     """
     scene, n, turn = iteration.scene, n_rows(state.gaussians), iteration.step // PERIOD
     views = [view for view in scene.train_views if view.point_ids is not None and len(view.point_ids)]
@@ -61,6 +63,6 @@ def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, 
 
 
 def _some(items: Any, most: int, turn: int) -> Any:
-    """Return every n-th of the items, so that there are at most so many; each turn begins with another."""
+    """Return at most ``most`` items, evenly spaced; each turn begins with another one."""
     stride = max(1, -(-len(items) // most))
     return items[turn % stride :: stride]

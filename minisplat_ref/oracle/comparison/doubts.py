@@ -1,4 +1,4 @@
-"""Which values of a scene depend on rounding: pixels at thresholds, and counts and sums over them.
+"""The values of a scene that depend on rounding: pixels at thresholds, and counts and sums over them.
 
 An exact scene leaves nothing to rounding, so nothing is set aside there.
 """

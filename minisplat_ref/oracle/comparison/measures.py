@@ -1,6 +1,6 @@
-"""How much two arrays differ, apart from values that rounding decides; and whether other bounds change the image.
+"""The difference of two arrays, apart from values that rounding decides, and the effect of other bounds on the image.
 
-Boxes and tile lists differ between renderers for good reasons; what counts is whether the image does. So the reference
+Boxes and tile lists differ between renderers for good reasons; only a difference of the image counts. So the reference
 renders the truth's footprints once more, within the other renderer's bounds or in its order.
 """
 
@@ -101,7 +101,7 @@ class Bounds(NamedTuple):
 def compare_bounds(given: Arrays, truth: Golden) -> Bounds | None:
     """Judge radii and boxes, whichever were given; None where neither was.
 
-    A Gaussian that the truth culls is drawn with the other renderer's footprint, if that was given.
+    A Gaussian that the truth culls is rendered with the other renderer's footprint, if that was given.
     """
     if "radii" not in given and "boxes" not in given:
         return None

@@ -34,7 +34,7 @@ def from_backend(backend: Backend, dtype: str, conventions: Conventions | None =
     dtype : str
         ``"float32"`` or ``"float64"``.
     conventions : Conventions, optional
-        Those that it follows, whatever the scene asks for; by default those of the scene.
+        Those that it follows, regardless of the scene's; by default those of the scene.
     """
 
     def arrays(truth: Golden) -> Arrays:
@@ -62,7 +62,7 @@ def by_profile(conventions: Conventions, dtype: str) -> ComparedRenderer:
 
 
 def from_dumps(path: str | Path, dtype: str | None = None) -> ComparedRenderer:
-    """Compare what is in ``path/SCENE/*.npz``.
+    """Compare the arrays in ``path/SCENE/*.npz``.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ NOT_OF_GSPLAT = ("loss", "statistics", "surface", "adam")  # stages that gsplat'
 
 
 def _on_gpu(name: str, dtype: str) -> ComparedRenderer:
-    """Return one of our backends for a GPU; where the simulator takes the GPU's place, its name says so."""
+    """Return one of our backends for a GPU; where the simulator replaces the GPU, the name mentions it."""
     backend = get_backend(name)
     where = " in the simulator" if backend.residence.is_simulated else ""
     return from_backend(replace(backend, name=f"{name}{where}"), dtype)
@@ -212,7 +212,7 @@ def choose_function(name: str, dtype: str | None, profile: str | None, arrays: s
     profile : str, optional
         Key of ``PROFILES``: its rules; by default those of gsplat's main branch.
     arrays : str, optional
-        ``"numpy"``, ``"torch"`` or ``"jax"``; by default what its module has imported.
+        ``"numpy"``, ``"torch"`` or ``"jax"``; by default the kind that its module has imported.
 
     Raises
     ------
@@ -235,13 +235,13 @@ def choose_scenes(
     Parameters
     ----------
     renderer : ComparedRenderer
-        Says which conventions it follows, and which scenes it has.
+        Determines the conventions and the scenes.
     name : str
         Of a scene, or ``"all"`` that the renderer has.
     against : str
         ``"reference"``, computed now, or a folder of golden vectors.
     profile : str, optional
-        Key of ``PROFILES`` that takes the place of every scene's conventions and of the renderer's own.
+        Key of ``PROFILES`` that replaces every scene's conventions and the renderer's own.
 
     Returns
     -------
@@ -254,7 +254,7 @@ def choose_scenes(
     Raises
     ------
     InputError
-        If there is no such scene, or the renderer has not drawn it.
+        If there is no such scene, or the renderer has no results for it.
     """
     known: Mapping[str, Golden | None]
     known = dict.fromkeys(recipe.name for recipe in RECIPES) if against == "reference" else load(against)
@@ -283,7 +283,7 @@ def choose_scenes(
 
 
 def _with_truth(golden: Golden, rules: Conventions, ignores: tuple[str, ...]) -> Golden:
-    """Return all arrays under these rules, with zeros for what is ignored; a folder's own if they are that already."""
+    """Return all arrays under these conventions, or a folder's own if it follows them; ignored ones are zero."""
     is_complete = "v_means" in golden.arrays and not any(golden.arrays[name].any() for name in ignores)
     if is_complete and rules == golden.conventions:
         return golden

@@ -1,9 +1,9 @@
-"""What an error looks like in the arrays of a comparison, and which planted faults look most alike.
+"""The signature of an error in the arrays of a comparison, and the planted faults whose signatures are most similar.
 
-An error in one formula leaves its traces downstream: some arrays are wrong, others right, and the wrong ones are off in
-a way of their own. Of each array that was given a *mark* is kept: whether it is wrong, how much of it relative to the
-others, whether it is off along itself (by a factor) or across, and in which columns. None of these depends much on how
-large the error is, or on the scene. The *signature* of a renderer is the mean of its marks over the scenes, with the
+An error in one formula leaves its traces downstream: some arrays are wrong, others right, and each wrong one is off in
+a characteristic way. Of each array that was given a *mark* is kept: whether it is wrong, how much of it relative to the
+others, whether it is off along itself (by a factor) or across, and in which columns. None of these depends much on the
+size of the error, or on the scene. The *signature* of a renderer is the mean of its marks over the scenes, with the
 scenes in which an array is wrong.
 
 The signatures of the faults of :mod:`minisplat_ref.oracle.faults` are measured by ``python -m data_tools.signatures``
@@ -33,16 +33,16 @@ INTERMEDIATE = {
     "opacities2d": "opacities",
     "radii": "radii",
 }
-"""What a function can return in its meta, by gsplat's names."""
+"""The entries that a function can return in its meta, by gsplat's names."""
 GRADIENTS = {f"v_{array}": f"a gradient of {key}" for array, key in INTERMEDIATE.items() if array != "radii"}
-LEAST_SHARE = 1e-4  # relative error, of the largest of all arrays, below which a mark says no less
+LEAST_SHARE = 1e-4  # relative error, of the largest of all arrays, below which all errors have the same mark
 FAR = 2.0  # difference of common logarithms of sizes from which on it counts in full
 WEIGHTS = {"wrong": 1.0, "size": 0.5, "along": 1.0, "columns": 1.0}
 """Of the parts of a distance, each from 0 to 1. Chosen among a dozen by the scenes of seed 1, and judged on others."""
 
 
 class Mark(NamedTuple):
-    """What is wrong with an array of one scene."""
+    """The error of an array in one scene."""
 
     is_wrong: bool
     size: float = 0.0
@@ -54,7 +54,7 @@ class Mark(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What is wrong with an array over several scenes."""
+    """The error of an array over several scenes."""
 
     wrong_in: frozenset[str]
     """Scenes."""
@@ -121,7 +121,7 @@ def signature(marks: Mapping[str, Mapping[str, Mark]]) -> Signature:
 
 
 def distance(found: Signature, known: Signature, scenes: Sequence[str]) -> float:
-    """Return how much two signatures differ, in units of one array that is wrong in one and right in the other.
+    """Return the distance of two signatures, in units of one array that is wrong in one and right in the other.
 
     An error of the other sign is the same error: it is the smaller of the two distances.
 
@@ -195,7 +195,7 @@ class Table(NamedTuple):
 
     scenes: tuple[str, ...]
     faults: Mapping[tuple[str, str], Signature]
-    """By what is wrong and where."""
+    """By the error and its place."""
 
 
 @functools.cache
@@ -206,7 +206,7 @@ def known_signatures(mode: str) -> Table:
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str]) -> Table:
-    """Return the table of what :func:`rows_of` has written."""
+    """Return the table from the rows of :func:`rows_of`."""
     faults = {}
     for row in rows:
         traces = {}
@@ -246,7 +246,7 @@ def _arrays_of_faults() -> frozenset[str]:
 
 
 def in_words(found: Signature, likely: Sequence[Likely], not_given: Iterable[str]) -> list[str]:
-    """Return what is wrong and right, the faults that look like it, and what else to return to tell them apart.
+    """Return the wrong and right arrays, the faults of a similar signature, and arrays that would distinguish them.
 
     Parameters
     ----------

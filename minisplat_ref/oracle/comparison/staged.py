@@ -72,7 +72,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 ONE_FUNCTION = {"features": "composite", "statistics": "composite"}
 """Stages of the golden format that a function of another stage computes."""
 FLIPPING = ("T", "image", "features", "statistics", "median depth", "view")  # flips are counted
-SLIGHT = 5.0  # times what is allowed, up to which a difference in few values is one of rounding
+SLIGHT = 5.0  # times the tolerance, up to which a difference in few values counts as rounding
 FEW = 0.01  # of the values of the arrays that are off
 BY_ROW = ("means2d", "depths", "conics", "opacities2d", "colors")  # compared where both show the Gaussian
 
@@ -94,7 +94,7 @@ class Row(NamedTuple):
     note: str = ""
     """One line."""
     marks: Mapping[str, Mark] = NOTHING
-    """What is wrong with each array that was given."""
+    """The error of each array that was given."""
 
 
 def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
@@ -150,7 +150,7 @@ def excess(row: Row) -> float:
 
 
 def _relation(renderer: ComparedRenderer, row: Row, first: Row) -> str:
-    """Say how a difference is related to the first one; return nothing if neither can cause the other.
+    """Describe how a difference is related to the first one; return nothing if neither can cause the other.
 
     It may follow from the first if it is computed from the wrong values; if the truth is the input of every stage, this
     is possible only in the view. Two results of one stage are wrong independently.
@@ -310,7 +310,7 @@ def marks_by_scene(rows: Iterable[Row]) -> dict[str, dict[str, Mark]]:
 
 
 def slight(rows: Iterable[Row]) -> list[str]:
-    """Say that the differences are those of rounding, if they are: a few values, little above what is allowed.
+    """Return a note if the differences are those of rounding: a few values, little above the tolerance.
 
     An error in a formula is wrong in most values; its signature would be looked for in noise.
     """

@@ -1,9 +1,9 @@
-"""Errors with a size: what a wrong renderer may have wrong, from which the signatures of errors are measured.
+"""Planted errors with a size, from which the signatures of errors are measured.
 
-:mod:`.planted` has errors that the oracle must find. These are the ones that it must tell apart. Each changes one
-formula of a backend. A fault of a forward formula has its own derivative, so that its gradients are those of what it
-computes. Most have a size, such as the factor by which a gradient is off: the table of signatures is measured at one
-size, and judged at others (:mod:`minisplat_ref.oracle.comparison.signatures`).
+:mod:`minisplat_ref.oracle.planted` has errors that the oracle must find; these are the ones that it must tell apart.
+Each changes one formula of a backend. A fault of a forward formula has its own derivative, so that its gradients are
+consistent with its images. Most have a size, such as the factor by which a gradient is off: the table of signatures is
+measured at one size, and judged at others (:mod:`minisplat_ref.oracle.comparison.signatures`).
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Backends with a wrong gradient and right images, by a size."""
+"""Backends with right images and a wrong gradient, whose error has a given size."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -14,7 +14,7 @@ from minisplat_ref.types import CompositeGradient, PrimitiveGradient, Projection
 
 
 def scale_gradient(stage: str, *fields: str, columns: tuple[float, ...] | None = None) -> Callable[[float], Backend]:
-    """Return what plants a factor in fields of the gradient of a stage; ``columns`` tells in which columns, by 1."""
+    """Return a fault that scales fields of a stage's gradient, in the columns where ``columns`` is 1."""
 
     def plant_factor(factor: float) -> Backend:
         by: Any = factor if columns is None else np.where(np.array(columns) == 1, factor, 1.0)
@@ -62,7 +62,7 @@ def with_v_depths(factor: float) -> Backend:
 
 
 def scale_share(name: str) -> Callable[[float], Backend]:
-    """Return what multiplies one function of the projection's gradient by the size."""
+    """Return a fault that multiplies one function of the projection's gradient by the size."""
     right = getattr(reference_projection, name)
 
     def plant_factor(factor: float) -> Backend:
@@ -73,5 +73,5 @@ def scale_share(name: str) -> Callable[[float], Backend]:
 
 
 def as_planted(name: str) -> Callable[[float], Backend]:
-    """Return what plants one of :data:`minisplat_ref.oracle.planted.PLANTED` in the reference."""
+    """Return a fault that plants one of :data:`minisplat_ref.oracle.planted.PLANTED` in the reference."""
     return lambda _: plant(name, REFERENCE)

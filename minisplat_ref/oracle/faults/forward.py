@@ -1,4 +1,4 @@
-"""Backends with a wrong forward formula and its own derivative, by a size."""
+"""Backends with a wrong forward formula and its derivative; the error has a given size."""
 
 import inspect
 from collections.abc import Callable

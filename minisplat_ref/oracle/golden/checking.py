@@ -10,7 +10,7 @@ from minisplat_ref.types import Ints
 
 
 def check_arrays(source: Path, arrays: Arrays, way_out: str) -> None:
-    """Refuse a scene whose shapes, types or indices are not those of the format.
+    """Refuse a scene whose shapes, types or indices contradict the format.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def export(path: str | Path, scenes: Mapping[str, Golden]) -> None:
 
 
 def load(path: str | Path) -> dict[str, Golden]:
-    """Read what :func:`export` wrote, and check it: format, version, hashes, names, shapes, dtypes.
+    """Read the files of :func:`export`, and check them: format, version, hashes, names, shapes, dtypes.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def load(path: str | Path) -> dict[str, Golden]:
     Raises
     ------
     InputError
-        If anything is missing, damaged or of another version; one line says what.
+        If anything is missing, damaged or of another version; the message of one line names it.
     """
     folder = Path(path)
     manifest = read_manifest(folder)
@@ -91,7 +91,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     Raises
     ------
     InputError
-        If it is no manifest, of another version, or a file that it lists is missing or is not what was written.
+        If it is no manifest, has another version, or a file that it lists is missing or was changed.
     """
     path = folder / MANIFEST
     if not path.exists():

@@ -1,8 +1,8 @@
-"""The golden format: every array by name, and the page that explains it to people who will never read our Python.
+"""The golden format: every array by name, and the page that explains it to readers who will never see our Python.
 
-An array has a name, a stage, a role, a shape, a unit, a meaning, and a tolerance that says how exactly it must be
-reproduced. Names are unique in a scene. The arrays of a stage are in one file; its inputs from other stages are in
-theirs. Left out: the activations (exponential, sigmoid), which belong to the trainer.
+An array has a name, a stage, a role, a shape, a unit, a meaning, and the tolerance within which it must be reproduced.
+Names are unique in a scene. The arrays of a stage are in one file; its inputs from other stages are in theirs. Left
+out: the activations (exponential, sigmoid), which belong to the trainer.
 """
 
 import inspect
@@ -39,7 +39,7 @@ class ArraySpec(NamedTuple):
     stage: str
     """Stage that it belongs to; name of its file."""
     role: Role
-    """What it is for that stage."""
+    """Its role in that stage."""
     shape: tuple[str | int, ...]
     """N Gaussians, R = K - 1 higher SH coefficients, M pairs, T1 = tiles + 1, H x W pixels, F channels, I x J rays,
     A x P parameters, V rows of them."""
@@ -199,7 +199,7 @@ STAGE_INPUTS = {
     ),
     "adam": ("adam_values", "adam_gradient", "adam_first", "adam_second", "adam_rows", "adam_settings"),
 }
-"""What each stage reads."""
+"""The arrays that each stage reads."""
 
 STAGE_COTANGENTS = {
     "project": ("v_means2d", "v_depths", "v_conics", "v_opacities2d"),
@@ -214,7 +214,8 @@ STAGE_COTANGENTS = {
     "view": ("v_image", "v_alpha", "v_expected_depth"),
     "adam": (),
 }
-"""What each stage's gradient reads beside that; the loss's starts from dL/d loss = 1, and ``total`` adds shares."""
+"""The arrays that each stage's gradient reads in addition; the loss's starts from dL/d loss = 1, and ``total`` adds
+shares."""
 
 
 def names_of(stage: str, *roles: Role) -> tuple[str, ...]:
@@ -384,7 +385,7 @@ def readme(scenes: Mapping[str, Golden]) -> str:
 
 
 def convention_words() -> dict[str, str]:
-    """What each field of :class:`Conventions` means, in the words of its documentation, by its name or names."""
+    """The meaning of each field of :class:`Conventions`, from its documentation, by its name or names."""
     words: dict[str, str] = {}
     _, _, attributes = inspect.cleandoc(Conventions.__doc__ or "").partition("----------\n")
     for line in attributes.splitlines():

@@ -65,9 +65,9 @@ def run_stages(
         Its inputs and the cotangents are read; whatever else it has is not. Without cotangents there are no gradients,
         and of the stages only those of the image.
     dtype : str
-        ``"float32"`` or ``"float64"``: what the stages compute in.
+        ``"float32"`` or ``"float64"``, the dtype of the stages.
     fed : dict, optional
-        All arrays of a truth: the input of each stage. By default each stage reads what the stage before it gave.
+        All arrays of a truth: the input of each stage. By default each stage reads the output of the stage before it.
     without : collection of str
         Stages behind the image that the backend does not have: loss, features, statistics, surface, view, adam.
 

@@ -1,4 +1,4 @@
-"""The scenes of the golden vectors: how their inputs are drawn, and all their arrays, computed by the reference.
+"""The scenes of the golden vectors: their random inputs, and all their arrays, computed by the reference.
 
 The scenes are small, random, and each has one thing that renderers get wrong. Their numbers are rounded to float32, so
 that float32 and float64 renderers get the same problem; only the rotation is not rounded, or it would be none. Two
@@ -19,10 +19,10 @@ from minisplat_ref.types import Floats, Primitives, ProjectionGradient, RenderOu
 
 
 class Recipe(NamedTuple):
-    """How a scene is drawn."""
+    """The distribution that a scene is drawn from."""
 
     name: str
-    what: str  # one line: what it is for
+    what: str  # its purpose, one line
     conventions: Conventions
     size: tuple[int, int] = (28, 20)  # px
     principal_point: tuple[float, float] = (0.5, 0.5)  # part of the size
@@ -125,7 +125,7 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     Returns
     -------
     Golden
-        Arrays of the role "input", except what depends on a renderer.
+        Arrays of the role "input", except those that depend on a renderer.
     """
     rng = np.random.default_rng((seed, *recipe.name.encode()))
     size, center = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point)

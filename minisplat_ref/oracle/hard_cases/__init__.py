@@ -1,6 +1,6 @@
 """Scenes that break renderers, as data: each with the reason, the correct behaviour, and the tolerance per precision.
 
-Reading order: ``subjects`` (what an entry is, and how it is drawn), ``scenes`` (building blocks); the entries:
+Reading order: ``subjects`` (the definition of an entry, and its rendering), ``scenes`` (building blocks); the entries:
 ``shapes``, ``layers`` (opacities, thresholds, depths), ``cameras`` (with world coordinates), ``images`` (with colours
 and losses), ``random_scenes`` (all of that at random, at three sizes), ``bad_input``; ``run`` (every precision, forward
 and backward, and the worst of each kind).

@@ -1,4 +1,4 @@
-"""Input that must be refused: one clear line instead of an image that nobody can trust."""
+"""Input that must be refused, with one clear line instead of an image that cannot be trusted."""
 
 from typing import Any
 

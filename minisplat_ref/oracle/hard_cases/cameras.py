@@ -1,4 +1,4 @@
-"""Hard cases of place: means that no camera sees, cameras that no photographer has, worlds far from zero."""
+"""Hard cases of position: means that no camera sees, cameras that no photographer has, worlds far from the origin."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Hard cases of images: one pixel or nothing in view, extreme colours, losses that divide 0 by nearly 0."""
+"""Hard cases of images: one pixel or nothing in view, extreme colours, losses that divide 0 by a tiny number."""
 
 import numpy as np
 

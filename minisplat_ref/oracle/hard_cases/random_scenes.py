@@ -1,7 +1,7 @@
 """Random scenes of many kinds, each at three sizes, to cover the space between the hand-made cases.
 
 A hand-made case tests one thing at its hardest. Here every number of a kind is random, many Gaussians overlap, and
-tiles, lists and sums are as long as in small trainings. Each kind is drawn at three sizes: a few Gaussians in a
+tiles, lists and sums are as long as in small trainings. Each kind has three sizes: a few Gaussians in a
 thumbnail, some, and many in several tiles whose size does not divide the image's.
 """
 
@@ -51,11 +51,11 @@ class Draw(NamedTuple):
         return np.column_stack([x * z, y * z, z])
 
     def log_uniform(self, low: float, high: float, *shape: int) -> Floats:
-        """Return numbers between two others, whose logarithms are uniform."""
+        """Return log-uniform random numbers between two bounds."""
         return np.exp(self.rng.uniform(np.log(low), np.log(high), shape))
 
     def gaussians(self, sh_degree: int = 0, **changes: Floats) -> Gaussians:
-        """Return Gaussians of ordinary shapes; what is changed is rounded to float32, too."""
+        """Return Gaussians of ordinary shapes; replaced arrays are rounded to float32, too."""
         rng, n = self.rng, self.n
         fields = {
             "means": self.means(),
@@ -126,7 +126,7 @@ def _at_the_near_plane(d: Draw) -> Subject:
 
 
 def _opacities_of(values: list[float], n_ulps: int = 2, **options: object) -> Callable[[Draw], Subject]:
-    """Opacities at some numbers and a few roundings beside them."""
+    """Opacities at the given numbers, and a few units in the last place away."""
 
     def make(d: Draw) -> Subject:
         chosen = d.rng.choice(np.array(values, np.float32), d.n)
@@ -227,7 +227,7 @@ def _align_with_axes(d: Draw) -> Subject:
 
 
 def _log_scales_40(d: Draw) -> Subject:
-    """Nearly balls: of a needle with these ends, the reference could not tell the thin axis from rounding."""
+    """Nearly balls: of a needle with these ends, the reference could not distinguish the thin axis from rounding."""
     sizes = d.rng.uniform(-40, 40, (d.n, 1)) + d.rng.uniform(-1, 1, (d.n, 3))
     return Parameters(d.gaussians(log_scales=sizes), d.view())
 

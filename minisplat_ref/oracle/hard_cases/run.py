@@ -3,7 +3,7 @@
 A case passes if every precision refuses it with the expected message; or if all outputs and all gradients are finite
 and within its tolerance of the reference. Derivatives with respect to the outputs are random, fixed and the same in all
 precisions, and zero at pixels on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a line for
-each kind: how many cases, how many are refused, and how far the worst is from the reference.
+each kind: the number of cases, how many are refused, and the largest error against the reference.
 """
 
 import fnmatch
@@ -168,7 +168,7 @@ def _cotangents(name: str, scale: float, drawn: Drawing, at_threshold: Bools | N
 
 
 def _problems_of_reference(case: HardCase, expected: Outcome) -> list[str]:
-    """Return what is wrong with the reference itself, or that the case checks nothing."""
+    """Return an error of the reference itself, or a note that the case checks nothing."""
     if (name := _not_finite(expected)) is not None:
         return [f"reference: {name} is not finite"]
     moved = [key for key, v in expected.gradients.items() if "background" not in key and v.any()]

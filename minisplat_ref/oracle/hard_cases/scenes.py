@@ -77,7 +77,7 @@ def call(
 ) -> Call:
     """Return activated Gaussians at ``means`` [N, 3] whose axes are the camera's; (0, 0, z) falls on a pixel's centre.
 
-    What is named like an array of ``rasterization`` replaces that array; the rest are options.
+    Arguments named like an array of ``rasterization`` replace that array; the rest are options.
     """
     n, (width, height) = len(means), size
     arrays = {

@@ -1,4 +1,4 @@
-"""Needles, pancakes, points and worlds: shapes whose covariance is nearly singular, or huge, or nothing at all."""
+"""Needles, pancakes, points and worlds: shapes whose covariance is nearly singular, huge, or zero."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Hard cases and their subjects: what is drawn, through the public functions, forward and backward.
+"""Hard cases and their subjects, which are rendered forward and backward through the public functions.
 
 A subject has float64 arrays whose numbers are exact in float32, so that every precision gets the same scene. Bad input
 is refused where users' input is: by :func:`check_gaussians`, which every file reader calls last, and by the checks of
@@ -74,17 +74,17 @@ class HardCase(NamedTuple):
     name: str
     """Unique; words with hyphens."""
     why: str
-    """Why it is hard, one line."""
+    """The reason why it is hard, one line."""
     correct: str
-    """What a correct renderer does, one line."""
+    """The behaviour of a correct renderer, one line."""
     build: Callable[[], Subject]
     """Makes the scene; its numbers are the same in every precision."""
     tolerance: HardCaseTolerance = ORDINARY
-    """How far each precision may be from the float64 reference."""
+    """The tolerance of each precision against the float64 reference."""
     is_background: bool = False
     """Whether the image is the background and nothing but the background has a gradient."""
     refusal: str | None = None
-    """Part of the message with which the input is refused; None where it is drawn."""
+    """Part of the message with which the input is refused; None where it is rendered."""
 
 
 class Drawing(NamedTuple):

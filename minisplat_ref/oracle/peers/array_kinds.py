@@ -1,8 +1,8 @@
 """One call of a rasterizer with NumPy arrays, torch tensors or JAX arrays, and its gradients: NumPy in, NumPy out.
 
 The gradients are those of the function's own ``vjp`` where there is one. Otherwise torch and JAX differentiate; plain
-NumPy has none. Torch also differentiates with respect to what the function tells in its meta, so that a gradient that
-is wrong can be found between the image and the projection.
+NumPy has none. Torch also differentiates with respect to entries of the function's meta, so that a wrong gradient can
+be located between the image and the projection.
 """
 
 import inspect
@@ -22,7 +22,7 @@ INTERMEDIATE = ("means2d", "depths", "conics", "opacities")  # of the meta, that
 
 
 class Call(NamedTuple):
-    """What a rasterizer is called with."""
+    """The arguments of a rasterizer."""
 
     leaves: dict[str, Floats]
     """Arguments that it is differentiated with respect to."""
@@ -35,12 +35,12 @@ class Call(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What it gave."""
+    """Its results."""
 
     colors: np.ndarray
     alphas: np.ndarray
     meta: dict[str, np.ndarray]
-    """What it told besides; empty where it tells nothing."""
+    """Its meta; empty where it returns none."""
     gradients: dict[str, np.ndarray]
     """With respect to leaves, by their names; an argument that nothing depends on is absent."""
     of_meta: dict[str, np.ndarray]
@@ -48,7 +48,7 @@ class Result(NamedTuple):
 
 
 def kind_of(function: Callable[..., Any]) -> str:
-    """Return which arrays a function computes with, by what its module has imported: torch, then jax, else numpy."""
+    """Return the kind of arrays that a function uses, by what its module has imported: torch, then jax, else numpy."""
     inner = inspect.unwrap(getattr(function, "func", function))  # of a functools.partial
     name = getattr(inner, "__module__", None) or type(inner).__module__
     values = vars(sys.modules[name]).values() if name in sys.modules else ()

@@ -68,12 +68,13 @@ def from_functions(functions: ModuleType, name: str, profile: Conventions, devic
 
 
 def rules_of(profile: Conventions) -> Callable[[Conventions], Conventions | None]:
-    """What a version of gsplat does with the conventions that a scene asks for."""
+    """How a version of gsplat handles the conventions of a scene."""
 
     def rules(asked: Conventions) -> Conventions | None:
         free = {field: getattr(asked, field) for field in ("is_antialiased", "near_plane", "far_plane", "eps2d")}
         ours = profile._replace(**free)
-        # Scenes by the rules of another family would be drawn wrongly, and say nothing about gsplat.
+        # Scenes under the conventions of another family would be rendered wrongly, which would prove nothing about
+        # gsplat.
         return ours if ours._replace(name=asked.name, alpha_max=asked.alpha_max) == asked else None
 
     return rules

@@ -1,9 +1,9 @@
 """Any function with the signature of gsplat's ``rasterization`` as a renderer to compare.
 
 It is called three times for each scene: for colours of spherical harmonics, for given features and depth, and for
-colours and expected depth. So an error of the harmonics is told from one of the blending, and of what the function says
-in its meta (gsplat's keys: ``means2d, depths, conics, opacities, radii, flatten_ids, isect_offsets, tile_size``) each
-stage is compared by itself. One scene has one camera.
+colours and expected depth. So an error of the harmonics is distinguished from one of the blending, and of the entries
+of the function's meta (gsplat's keys: ``means2d, depths, conics, opacities, radii, flatten_ids, isect_offsets,
+tile_size``) each stage is compared by itself. One scene has one camera.
 
 A function without ``render_mode``, or which raises ``NotImplementedError`` for one, is compared without depth.
 """
@@ -37,7 +37,7 @@ class Rasterizer(NamedTuple):
     function: Callable[..., Any]
     vjp: Callable[..., Any] | None
     kind: str
-    """``numpy``, ``torch`` or ``jax``: what it is called with."""
+    """The kind of its arguments: ``numpy``, ``torch`` or ``jax``."""
     accepts: Callable[[str], bool]
     """Whether it has a parameter of this name."""
 
@@ -64,9 +64,9 @@ def from_function(
     name : str, optional
         For reports.
     arrays : {"numpy", "torch", "jax"}, optional
-        What to call it with; by default what its module has imported.
+        The kind of its arguments; by default the one that its module has imported.
     dtype : {"float32", "float64"}
-        What it computes in.
+        The dtype of its computation.
     profile : Conventions
         Its rules, where the scenes leave a choice: how alpha is clamped, for example.
 
@@ -92,10 +92,10 @@ def from_function(
 
 
 def _parameters(function: Callable[..., Any], name: str) -> Callable[[str], bool]:
-    """Return which parameters a function has; refuse one that cannot be called like gsplat's."""
+    """Return the parameters of a function; refuse one that cannot be called like gsplat's."""
     try:
         parameters = inspect.signature(function).parameters
-    except (TypeError, ValueError):  # compiled code may not tell
+    except (TypeError, ValueError):  # compiled code may have no signature
         return lambda _: True
     named = {
         p.name: p for p in parameters.values() if p.kind in (inspect.Parameter.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
@@ -131,7 +131,7 @@ def _missing_options(rasterizer: Rasterizer, conventions: Conventions) -> list[s
 
 
 def _colors(rasterizer: Rasterizer, truth: Golden, dtype: str) -> Arrays:
-    """Colours of spherical harmonics: the image, and all that the function tells about it."""
+    """Colours from spherical harmonics: the image, and everything that the function returns with it."""
     a = truth.arrays
     result = _call(rasterizer, truth, dtype, "RGB", _coefficients(truth), a["background"], a["v_image"], a["v_alpha"])
     assert result is not None  # every function has colours
@@ -248,7 +248,7 @@ def _check_shapes(where: str, result: Result, call: Call) -> None:
 
 
 def _read_meta(rasterizer: Rasterizer, result: Result) -> Arrays:
-    """Return what the meta says of the one camera, in the golden format."""
+    """Return the meta of the one camera, in the golden format."""
     meta, n = result.meta, len(result.colors)
     for name in (*META, "isect_offsets"):
         if name in meta and (meta[name].ndim == 0 or len(meta[name]) != n):

@@ -10,8 +10,8 @@ them from a package that does:
 * their sums over a pixel, in two;
 * the 0.5 and the zero below colours, and the background behind the image, which gsplat adds in its own front end.
 
-It runs in the dtype of its input, like any backend. Its clamp of alpha is 0.999 whatever the conventions say: compare
-under ``GSPLAT_1_5``. It culls by position only, and its radii are 3.33 sigma whatever the opacity.
+It runs in the dtype of its input, like any backend. Its clamp of alpha is always 0.999, regardless of the conventions:
+compare under ``GSPLAT_1_5``. It culls by position only, and its radii are 3.33 sigma whatever the opacity.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ def load() -> tuple[ModuleType, ModuleType]:
 
 
 def gsplat_torch() -> Backend:
-    """Return gsplat's functions as a backend; what gsplat does not have is the reference's.
+    """Return gsplat's functions as a backend; functions that gsplat lacks are the reference's.
 
     Raises
     ------

@@ -13,7 +13,7 @@ N_SHOWN = 8  # names that a message proposes
 
 
 def load_function(text: str) -> tuple[Callable[..., Any], Callable[..., Any] | None]:
-    """Import a function, and the gradient of the name ``function_vjp`` if there is one beside it.
+    """Import a function, and its gradient ``function_vjp`` if the module has one.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """``rasterization`` with ``camera_model``, ``with_ut`` and ``with_eval3d`` as a call that is compared.
 
-gsplat's own function is given its own keywords, so it can be compared where its kernels run. Culling is compared as
-which Gaussians have radii, not by their size, which bounds and does not draw.
+gsplat's own function is given its own keywords, so it can be compared where its kernels run. Culling is compared by
+which Gaussians have radii, not by the radii's size, which does not change the image.
 """
 
 from collections.abc import Mapping

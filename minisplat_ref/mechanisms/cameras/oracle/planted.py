@@ -16,7 +16,7 @@ Bend = Callable[[list[float], list[float]], tuple[list[float], list[float]]]
 
 
 def _bent(change: Bend) -> Callable[[Steps], Steps]:
-    """Return what changes the radial and tangential coefficients of pinholes."""
+    """Return a fault that changes the radial and tangential coefficients of pinholes."""
 
     def plant(steps: Steps) -> Steps:
         def bend(camera: Camera, model: str, k: list[float], p: list[float]) -> Camera:
@@ -67,7 +67,7 @@ def _one_sigma(steps: Steps) -> Steps:
 
 
 def _without(field: str) -> Callable[[Steps], Steps]:
-    """Return what drops the gradient with respect to a field of the footprints."""
+    """Return a fault that drops the gradient with respect to a field of the footprints."""
 
     def plant(steps: Steps) -> Steps:
         def project_vjp(primitives: Primitives, f: LensFootprints, v: FootprintGradient) -> Any:

@@ -1,9 +1,9 @@
 """Rules by which a version of gsplat departs from ours ``with_ut`` and ``with_eval3d``, as changes of the steps.
 
-gsplat 1.5 culls what is behind the plane of the camera and orders by the centres' z, through a fisheye, too. It drops a
-Gaussian unless all of its seven sigma points lie in the image or a margin of a tenth of its size around it, where ours
-takes the whole image for its bounds; so a large one disappears at the border. Within its bounds it draws whole tiles
-of 16 pixels, which shows since the bounds of an unscented transform are not those of the response.
+gsplat 1.5 culls Gaussians behind the plane of the camera and orders by the centres' z, through a fisheye, too. It drops
+a Gaussian unless all of its seven sigma points lie in the image or a margin of a tenth of its size around it, where
+ours takes the whole image for its bounds; so a large one disappears at the border. Within its bounds it renders whole
+tiles of 16 pixels, which is visible since the bounds of an unscented transform are not those of the response.
 """
 
 import inspect
@@ -26,7 +26,7 @@ TILE = 16  # pixels
 
 
 def exchange(**functions: Any) -> Callable[[Steps], Steps]:
-    """Return what exchanges functions that the projection and its gradient call."""
+    """Return a change that exchanges functions that the projection and its gradient call."""
 
     def plant(steps: Steps) -> Steps:
         names = {**vars(ray_footprints), **functions}
@@ -38,7 +38,7 @@ def exchange(**functions: Any) -> Callable[[Steps], Steps]:
 
 
 def in_front(camera: Camera) -> CameraModel:
-    """See what is in front of the camera alone, through a fisheye too."""
+    """See only points in front of the camera, through a fisheye too."""
     model = model_of(camera)
     return model._replace(is_seen=lambda x, camera: (x[:, 2] > 0) & model.is_seen(x, camera))
 

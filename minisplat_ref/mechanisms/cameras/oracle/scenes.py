@@ -1,7 +1,7 @@
 """Scenes on which ``rasterization`` with other cameras is compared: arguments of one call, with cotangents.
 
 The numbers are rounded to float32, so that renderers of either precision get the same problem. ``brown`` has all six
-radial and both tangential coefficients; ``fisheye`` sees what is beside and behind the camera, up to 130 degrees from
+radial and both tangential coefficients; ``fisheye`` sees Gaussians beside and behind the camera, up to 130 degrees from
 the axis; ``hard`` has a lens that folds outside of the image, and Gaussians beyond the fold, behind the camera, at the
 border of the image and around the camera; ``ortho`` has parallel rays.
 """

@@ -27,7 +27,7 @@ from minisplat_ref.oracle.tolerances import (
 )
 from minisplat_ref.types import Floats
 
-# Third scales have no gradient; the last row of a view matrix, and what a function does with it, is not compared.
+# Third scales have no gradient; the last row of a view matrix, and its gradient, is not compared.
 PARTS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = defaultdict(
     lambda: np.asarray, v_scales=lambda v: v[:, :2], v_viewmats=lambda v: v[:, :3]
 )

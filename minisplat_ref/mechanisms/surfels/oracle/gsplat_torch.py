@@ -2,8 +2,9 @@
 
 gsplat tests its kernels against ``_torch_impl_2dgs``; that file and ``depth_to_normal`` are loaded alone, because
 importing the package looks for CUDA. They compute projection, alphas, colours, opacities, normals and surface normals,
-and torch differentiates them. What gsplat has in CUDA only is ours: which hits a pixel blends, from the reference's
-thresholds (no gradient goes through it), and the median depth and the distortion, in a few lines of torch each.
+and torch differentiates them. The parts that gsplat has in CUDA only are ours: which hits a pixel blends, from the
+reference's thresholds (no gradient goes through it), and the median depth and the distortion, in a few lines of torch
+each.
 
 Its normals are multiplied by the third scale, which the kernels leave out: give it third scales of one.
 """
@@ -145,7 +146,7 @@ def _accumulate(
 def _along_rays(
     weights: Tensor, transmittances: Tensor, z: Tensor, pixels: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Return the median depth and the distortion [1, H, W, 1] of the hits; see :mod:`..ray_measures`."""
+    """Return the median depth and the distortion [1, H, W, 1] of the hits, as :mod:`..ray_measures` defines them."""
     torch, _ = load()
     is_first = torch.ones_like(pixels, dtype=torch.bool)
     is_first[1:] = pixels[1:] != pixels[:-1]

@@ -1,6 +1,6 @@
 """Hard cases of surfels: each has an answer that was worked out without the renderer's formulas.
 
-A single disc in front of a simple camera, or a few, and one pixel to look at. Whatever the answer, all images and all
+A single disc in front of a simple camera, or a few, and one pixel to examine. Whatever the answer, all images and all
 gradients have to be finite. Left out: rays that lie in the plane of a disc, of which rounding decides where they hit;
 gsplat skips a hit whose p_2 is 0 exactly, and we leave the low-pass, which is the limit from both sides.
 """

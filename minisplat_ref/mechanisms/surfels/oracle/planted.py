@@ -14,7 +14,7 @@ from minisplat_ref.types import Floats, RenderOutput
 
 
 def _projected(change: Callable[..., Surfels]) -> Callable[[Steps], Steps]:
-    """Return what changes the result of the projection; ``change(surfels, primitives, camera)``."""
+    """Return a fault that changes the result of the projection; ``change(surfels, primitives, camera)``."""
 
     def plant(steps: Steps) -> Steps:
         def project(primitives: Any, camera: Any, *rest: Any) -> Surfels:
@@ -26,7 +26,7 @@ def _projected(change: Callable[..., Surfels]) -> Callable[[Steps], Steps]:
 
 
 def _shown(change: Callable[[Shown], Shown]) -> Callable[[Steps], Steps]:
-    """Return what changes the surfels that are blended, in the forward and in the backward pass."""
+    """Return a fault that changes the surfels that are blended, in the forward and in the backward pass."""
 
     def plant(steps: Steps) -> Steps:
         return steps._replace(

@@ -1,7 +1,7 @@
 """Scenes on which a ``rasterization_2dgs`` is compared: arguments of one call, with cotangents for its six images.
 
 The numbers are rounded to float32, so that renderers of either precision get the same problem. Third scales are one,
-because gsplat's torch functions multiply normals by them and its kernels do not. ``hard`` holds what is special about
+because gsplat's torch functions multiply normals by them and its kernels do not. ``hard`` holds the special cases of
 surfels: discs seen from the edge, at a grazing angle, behind the camera and across its plane, and smaller than a pixel.
 """
 
