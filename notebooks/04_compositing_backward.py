@@ -36,7 +36,7 @@ from scipy.optimize import brentq
 
 from figures import BLUE, GREY, RED, draw_ellipses, show_code, show_pixels
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.reference.compositing import blend_tile_vjp, composite, composite_vjp, light_vjp
+from minisplat_ref.reference.compositing import blend_tile_vjp, composite, composite_vjp, light_gradient
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.tiling import bin_gaussians
@@ -352,7 +352,7 @@ check("v_conic", v_conics, by_differences("conics"), package.conics)
 # `reference/hits.py`. Only relatives of 3DGS have a `shading`:
 
 # %%
-show_code(light_vjp)
+show_code(light_gradient)
 print()
 show_code(blend_tile_vjp)
 

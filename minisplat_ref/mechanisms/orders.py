@@ -20,10 +20,10 @@ from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
 from minisplat_ref.reference.blend_stats import add_tile_stats, median_depths
 from minisplat_ref.reference.compositing import (
     TileGradient,
-    add_tile_vjp,
+    add_tile_gradient,
     blend_tile,
     empty_output,
-    light_vjp,
+    light_gradient,
 )
 from minisplat_ref.reference.hits import Response, TileHits, goes_on, tile_hits, transmit
 from minisplat_ref.reference.removal import hit_colors
@@ -177,12 +177,12 @@ def composite_hits_vjp(
         v, alphas = v_image[tile.ys, tile.xs], tile.alphas  # [P, D], [G, P]
         T, T_end = tile.transmittances[:-1], tile.transmittances[-1]  # [G, P], [P]
         weights = alphas * T
-        v_c, v_dot_c, v_place = light_vjp(tile, weights, colors, response.response.shading, v)
+        v_c, v_dot_c, v_place = light_gradient(tile, weights, colors, response.response.shading, v)
         v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
         behind = undo_sort_by(order, _sum_behind(sort_by(order, weights * v_dot_c))) + T_end * v_T_end
         v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
         v_tile = TileGradient(v_alphas, v_c, v_place, T_end @ v)
-        add_tile_vjp(sums, response.response, primitives, tile, conventions, v_tile)
+        add_tile_gradient(sums, response.response, primitives, tile, conventions, v_tile)
     return sums
 
 

@@ -11,7 +11,7 @@ from minisplat_ref.types import BlendStats, Floats, Ints
 
 
 def empty_stats(n: int, shape: tuple[int, int], dtype: np.dtype) -> BlendStats:
-    """Return the statistics of n primitives without hits, for an image of ``shape`` (H, W)."""
+    """Return the statistics of n primitives without hits, for an image of ``shape`` (H, W); weights have the dtype."""
     counts, dominant_ids = np.zeros(n, np.int32), np.full(shape, -1, np.int32)
     return BlendStats(np.zeros(n, dtype), np.zeros(n, dtype), counts, counts.copy(), dominant_ids)
 
@@ -40,7 +40,7 @@ def add_tile_stats(stats: BlendStats, tile: TileHits, weights: Floats, heaviest:
 
 
 def median_depths(tile: TileHits) -> Floats:
-    """Return for each pixel the depth [P] of the hit that takes T below one half; 0 where none does."""
+    """Return the depth [P] of the hit that takes each pixel of a tile below T = 1/2; 0 where none does."""
     T = tile.transmittances[:-1]  # [G, P]
     is_median = (T >= MEDIAN_TRANSMITTANCE) & (T * (1 - tile.alphas) < MEDIAN_TRANSMITTANCE)
     depths: Floats = np.where(is_median, tile.hit.depths, 0).sum(axis=0)

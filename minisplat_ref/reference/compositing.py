@@ -100,21 +100,30 @@ def blend_tile_vjp(
     """
     alphas, T, T_end = tile.alphas, tile.transmittances[:-1], tile.transmittances[-1]
     weights = alphas * T  # [G, P]
-    v_c, v_dot_c, v_place = light_vjp(tile, weights, colors, shading, v_image)
+    v_c, v_dot_c, v_place = light_gradient(tile, weights, colors, shading, v_image)
     v_T_end = v_image @ background - v_alpha  # [P]
     behind = _sum_behind(weights * v_dot_c) + T_end * v_T_end  # [G, P]
     v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
     return TileGradient(v_alphas, v_c, v_place, T_end @ v_image)
 
 
-def light_vjp(
+def light_gradient(
     tile: TileHits, weights: Floats, colors: Floats, shading: Shading | None, v: Floats
 ) -> tuple[Floats, Floats, Any]:
-    """Gradient of ``sum_g w_g c_g`` with respect to colours [G, S], weights [G, P] and places.
+    """Return the gradient of ``sum_g w_g c_g`` with respect to colours [G, S], weights [G, P] and places.
 
     ::
 
         v_c_g = w_g v,   v_w_g = c_g . v
+
+    Parameters
+    ----------
+    tile, colors, shading
+        As for :func:`blend_tile`.
+    weights : ndarray of shape (G, P)
+        w.
+    v : ndarray of shape (P, D)
+        Derivative with respect to the sums.
     """
     c = colors[tile.ids]  # [G, S]
     if shading is None:
@@ -182,8 +191,8 @@ def composite_hits_vjp(
 ) -> BlendGradient:
     """Gradient of :func:`composite_hits` with respect to what it blends.
 
-    It is that of :func:`blend_tile` in every tile. The skip, the stop and the order are treated as fixed: the image
-    jumps there and has no derivative.
+    It is that of :func:`blend_tile`, summed over the tiles: ``v_c_g = sum over pixels of w_g v``. The skip, the stop
+    and the order are treated as fixed: the image jumps there and has no derivative.
 
     Parameters
     ----------
@@ -208,7 +217,7 @@ def composite_hits_vjp(
     for tile in tile_hits(primitives, bins, conventions, response):
         pixels = tile.ys, tile.xs
         v = blend_tile_vjp(tile, colors, background, response.shading, v_image[pixels], v_alpha[pixels])
-        add_tile_vjp(sums, response, primitives, tile, conventions, v)
+        add_tile_gradient(sums, response, primitives, tile, conventions, v)
     return sums
 
 
@@ -341,14 +350,20 @@ def composite_all_pairs(
 def empty_output(
     colors: Floats, background: Floats, bins: TileBins, with_stats: bool, with_median_depth: bool
 ) -> RenderOutput:
-    """Return arrays for the image, alpha and what is asked for, to be filled tile by tile."""
+    """Return arrays for the image, alpha and what is asked for, to be filled tile by tile.
+
+    Parameters
+    ----------
+    colors, background, bins, with_stats, with_median_depth
+        As for :func:`composite_hits`; read for their sizes and dtypes.
+    """
     shape, dtype = (bins.grid.height, bins.grid.width), colors.dtype
     image, alpha = np.empty((*shape, len(background)), dtype), np.empty(shape, dtype)
     median_depth = np.zeros(shape, dtype) if with_median_depth else None
     return RenderOutput(image, alpha, median_depth, empty_stats(len(colors), shape, dtype) if with_stats else None)
 
 
-def add_tile_vjp(
+def add_tile_gradient(
     sums: BlendGradient,
     response: Response,
     primitives: Any,
@@ -356,7 +371,19 @@ def add_tile_vjp(
     conventions: Conventions,
     v: TileGradient,
 ) -> None:
-    """Add the gradient of a tile: that of the response, with ``v_alpha_g`` 0 where alpha was clamped."""
+    """Add the gradient of a tile: that of the response, with ``v_alpha_g`` 0 where alpha was clamped.
+
+    Parameters
+    ----------
+    sums : BlendGradient
+        Is changed.
+    response, primitives, conventions
+        As for :func:`composite_hits`.
+    tile : TileHits
+        The hits.
+    v : TileGradient
+        From :func:`blend_tile_vjp`.
+    """
     v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v.alphas)
     v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v.alphas)
     v_rows = response.hit_vjp(primitives, tile.ids, tile.hit, v_mean, v_shape, v.place)

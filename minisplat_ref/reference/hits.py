@@ -195,7 +195,7 @@ def tile_hits(
 
 
 def transmit(alphas: Floats) -> Floats:
-    """Return T before each of G hits and after the last, [G + 1, P]: the running product of ``1 - alpha``."""
+    """Return T before each of G hits ``alphas`` [G, P] and after the last, [G + 1, P]: products of ``1 - alpha``."""
     ones = np.ones_like(alphas, shape=(1, alphas.shape[1]))
     return np.cumprod(np.concatenate([ones, 1 - alphas]), axis=0)
 

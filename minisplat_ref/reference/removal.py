@@ -88,7 +88,7 @@ def removal_changes_of_hits(
 
 
 def hit_colors(tile: TileHits, colors: Floats, shading: Shading | None) -> Floats:
-    """Return the colour of each hit [G, P, D]."""
+    """Return the colour of each hit of a tile [G, P, D]; ``colors`` are coefficients where there is a ``shading``."""
     if shading is not None:
         return shading.shade(colors[tile.ids], tile.hit.place)
     return np.broadcast_to(colors[tile.ids][:, None], (*tile.alphas.shape, colors.shape[1]))
