@@ -123,7 +123,13 @@ ORDER = (
                 "scale, compactness, storage, editing",
             ),
             Step(
-                ("mechanisms/tangent/", "extensions/pixel_order/", "mechanisms/rays/", "extensions/rays/"),
+                (
+                    "mechanisms/orders.py",
+                    "mechanisms/tangent/",
+                    "extensions/pixel_order/",
+                    "mechanisms/rays/",
+                    "extensions/rays/",
+                ),
                 (18,),
                 "depth order per pixel; rays, shadows and mirrors",
             ),

@@ -89,9 +89,9 @@ _EQUALITY = (
     ),
     PlantedLine(
         "median where T equals one half",
-        "reference.compositing:composite_hits",
-        "[1:] < MEDIAN_TRANSMITTANCE",
-        "[1:] <= MEDIAN_TRANSMITTANCE",
+        "reference.blend_stats:median_depths",
+        "(T >= MEDIAN_TRANSMITTANCE) & (T * (1 - tile.alphas) < MEDIAN_TRANSMITTANCE)",
+        "(T > MEDIAN_TRANSMITTANCE) & (T * (1 - tile.alphas) <= MEDIAN_TRANSMITTANCE)",
     ),
     PlantedLine(
         "drawn on the near plane",
@@ -170,18 +170,18 @@ _BLENDING = (
     ),
     PlantedLine(
         "largest weight summed over tiles",
-        "reference.compositing:composite_hits",
+        "reference.blend_stats:add_tile_stats",
         "np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))",
         "stats.blend_weight_max[ids] + weights.max(axis=1)",
     ),
     PlantedLine(
-        "faint hits not counted", "reference.compositing:composite_hits", "(weights > 0).sum", "(weights > 1e-4).sum"
+        "faint hits not counted", "reference.blend_stats:add_tile_stats", "(weights > 0).sum", "(weights > 1e-4).sum"
     ),
     PlantedLine(
         "last of the largest weights dominates",
         "reference.compositing:composite_hits",
-        "np.argmax(sort_by(order, weights), axis=0)",
-        "len(ids) - 1 - np.argmin(sort_by(order, weights)[::-1], axis=0)",
+        "np.argmax(weights, axis=0)",
+        "len(tile.ids) - 1 - np.argmax(weights[::-1], axis=0)",
     ),
     PlantedLine(
         "expected depth's gradient",

@@ -33,7 +33,7 @@ from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show_code, show_pixels
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.tracer import pixel_rays
-from minisplat_ref.reference.compositing import composite, composite_all_pairs, composite_hits
+from minisplat_ref.reference.compositing import blend_tile, composite, composite_all_pairs
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.projection import project
@@ -95,12 +95,13 @@ plt.show()
 #
 # $T_i$ is the *transmittance*: the share of the background's light that the hits in front let through. $\alpha_i T_i$
 # is the *weight* of hit $i$. The weights and what is left for the background add up to one, so the pixel's colour is a
-# weighted mean. In the package, with hits along the rows and the pixels of a tile along the columns, these are four
-# lines (`unsorted_by` matters only to relatives of 3DGS whose hits have another order in every pixel):
+# weighted mean. In the package, with hits along the rows and the pixels of a tile along the columns, these are five
+# lines:
 
 # %%
-lines = [line.strip() for line in inspect.getsource(composite_hits).splitlines()]
-blending = [line for line in lines if line.startswith(("weights =", "light = weights", "image[", "alpha["))]
+lines = [line.strip() for line in inspect.getsource(blend_tile).splitlines()]
+starts = "T, T_end =", "weights =", "light = weights", "image =", "alpha ="
+blending = [line for line in lines if line.startswith(starts)]
 print(*blending, sep="\n")
 
 # %% [markdown]
@@ -108,7 +109,8 @@ print(*blending, sep="\n")
 # |---|---|---|
 # | `minisplat_ref/reference/tiling.py` | which ellipses a tile has to blend, in which order | 3DGS sec. 6 |
 # | `minisplat_ref/reference/hits.py` | alpha of a hit, transmittance in front of it | 3DGS (3), (4) |
-# | `minisplat_ref/reference/compositing.py` | image, alpha, median depth, blend statistics | 3DGS (3) |
+# | `minisplat_ref/reference/compositing.py` | image, alpha and their gradient | 3DGS (3) |
+# | `minisplat_ref/reference/blend_stats.py` | median depth, blend statistics | |
 #
 # *3DGS* is Kerbl et al. 2023. **Frames and units:** image coordinates are pixels, x right, y down; the centre of the
 # top-left pixel is (0.5, 0.5). Depth is camera z, here in metres.

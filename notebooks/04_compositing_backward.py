@@ -36,7 +36,7 @@ from scipy.optimize import brentq
 
 from figures import BLUE, GREY, RED, draw_ellipses, show_code, show_pixels
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.reference.compositing import composite, composite_hits_vjp, composite_vjp
+from minisplat_ref.reference.compositing import blend_tile_vjp, composite, composite_vjp, light_gradient
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.tiling import bin_gaussians
@@ -348,11 +348,13 @@ check("v_conic", v_conics, by_differences("conics"), package.conics)
 
 # %% [markdown]
 # That is all. The package does the same for a whole tile at once, with hits along the rows and pixels along the
-# columns. What an ellipse does to a pixel, sections 3 to 6, is `response.hit_vjp`; `shade` and `order` serve relatives
-# of 3DGS:
+# columns. Sections 1 and 2 are these functions; what an ellipse does to a pixel, sections 3 to 6, is `conic_hit_vjp` of
+# `reference/hits.py`. Only relatives of 3DGS have a `shading`:
 
 # %%
-show_code(composite_hits_vjp)
+show_code(light_gradient)
+print()
+show_code(blend_tile_vjp)
 
 # %% [markdown]
 # ## What each parameter does to the picture

@@ -117,10 +117,10 @@ print(f"the set of rows, strip by strip: {int(bits):064b}")
 #
 # ## A tile is 64 rows, a set of rows is one integer
 #
-# `reached_rows` is the function that the kernel calls; here it ran as plain Python. Its result is one integer, printed
-# above, with one bit per row. The rows in which some pixel still accepts hits are another such integer. The work for a
-# Gaussian is the intersection of the two, a single `&`. So finished rows cost nothing, row by row and not only when the
-# whole tile is finished.
+# `find_reached_rows` is the function that the kernel calls; here it ran as plain Python. Its result is one integer,
+# printed above, with one bit per row. The rows in which some pixel still accepts hits are another such integer. The
+# work for a Gaussian is the intersection of the two, a single `&`. So finished rows cost nothing, row by row and not
+# only when the whole tile is finished.
 #
 # ## What is left to visit
 #

@@ -13,6 +13,7 @@ from data_tools.claims.kit.figures import table_of
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, SH_C0, Conventions
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
+from minisplat_ref.mechanisms.orders import blending_order
 from minisplat_ref.mechanisms.tangent.planes import hit, project
 from minisplat_ref.mechanisms.tangent.rays import (
     METHODS,
@@ -24,7 +25,6 @@ from minisplat_ref.mechanisms.tangent.rays import (
     yaw_camera,
 )
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.reference.hits import blending_order
 from minisplat_ref.rendering import activate
 from minisplat_ref.types import Camera, Floats, Gaussians, Primitives
 

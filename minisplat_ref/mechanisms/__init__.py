@@ -2,6 +2,7 @@
 
 ==================  ====================================================================================
 :mod:`.rays`        rays through a tree of Gaussians of any shape, forward and backward
+:mod:`.orders`      each pixel takes its hits in its own order, exactly or within a buffer
 :mod:`.tangent`     footprints on tangent planes of the unit sphere, each pixel with its own order
 :mod:`.peeling`     translucent triangle meshes by depth peeling, with gradients
 :mod:`.payload`     footprints of 3DGS with data that change their pixels: a texture, a cut, vertices

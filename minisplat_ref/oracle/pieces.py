@@ -25,9 +25,9 @@ from minisplat_ref.oracle.stages import (
     surface_stage,
     with_module,
 )
-from minisplat_ref.reference.hits import CONIC, Hit, Response, tile_hits
+from minisplat_ref.reference.hits import CONIC, Hit, Response, Shading, tile_hits
 from minisplat_ref.rendering import splatting
-from minisplat_ref.types import Floats, Ints, Projection, TileBins, TileGrid
+from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins, TileGrid
 
 Module = Any
 """A module, or a changed copy of it."""
@@ -162,8 +162,8 @@ def _sh_pieces(m: Module) -> tuple[Stage, ...]:
     return (sh_stage(stages, tiny_setting(sh_degree=3)),)
 
 
-def _slant(hits: Module) -> Response:
-    """Return the conic with depths and colours that vary over the Gaussian; pixels sort two hits at a time."""
+def slant(hits: Module) -> Response:
+    """Return the conic with depths and colours that vary over the Gaussian."""
 
     def hit(projection: Projection, ids: Ints, centers: Floats) -> Hit:
         flat: Hit = hits.conic_hit(projection, ids, centers)
@@ -181,11 +181,22 @@ def _slant(hits: Module) -> Response:
         x = place.offsets[:, :, 0]
         return np.einsum("gpd,gp->gd", v, np.sin(x)), np.einsum("gpd,gd,gp->gp", v, colors, np.cos(x))
 
-    return Response(CONIC.boxes, hit, hit_vjp, CONIC.fields, shade, shade_vjp, buffer_size=2)
+    return Response(CONIC.boxes, hit, hit_vjp, CONIC.fields, Shading(shade, shade_vjp))
 
 
-def _make_blending_stage(compositing: Module, response: Response) -> Stage:
-    """Return ``composite_hits`` of a response to projected Gaussians; tile lists and boxes are fixed."""
+def _list_sides(response: Response, projection: Projection, bins: TileBins) -> tuple[Bools, ...]:
+    """Return which hits of every tile are blended, and which are clamped."""
+    tiles = tile_hits(projection, bins, GSPLAT_MAIN, response)
+    return tuple(side for tile in tiles for side in (tile.alphas > 0, tile.is_clamped))
+
+
+def blending_stage(
+    compositing: Module, response: Any, list_sides: Callable[..., tuple[Any, ...]] = _list_sides
+) -> Stage:
+    """Return ``composite_hits`` of a response to projected Gaussians; tile lists and boxes are fixed.
+
+    ``list_sides`` maps the response, footprints and tile lists to the decisions of a point.
+    """
     plain, p, bins = composite_stage(with_module(), tiny_setting()), *project_setting(tiny_setting())
 
     def moved(means2d: Floats, conics: Floats, opacities: Floats) -> Projection:
@@ -194,9 +205,7 @@ def _make_blending_stage(compositing: Module, response: Response) -> Stage:
     def function(means2d: Floats, conics: Floats, opacities: Floats, colors: Floats, background: Floats) -> Point:
         q = moved(means2d, conics, opacities)
         output = compositing.composite_hits(response, q, colors, background, bins, GSPLAT_MAIN)
-        tiles = tile_hits(q, bins, GSPLAT_MAIN, response)
-        sides = [side for tile in tiles for side in (tile.alphas > 0, tile.is_clamped, np.asarray(tile.order))]
-        return Point((output.image, output.alpha), tuple(sides))
+        return Point((output.image, output.alpha), list_sides(response, q, bins))
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
         arguments = response, p, plain.inputs["colors"], plain.inputs["background"], bins, GSPLAT_MAIN
@@ -207,12 +216,12 @@ def _make_blending_stage(compositing: Module, response: Response) -> Stage:
 
 
 def _hits_pieces(m: Module) -> tuple[Stage, ...]:
-    return (_make_blending_stage(reference.compositing, _slant(m)),)
+    return (blending_stage(reference.compositing, slant(m)),)
 
 
 def _compositing_pieces(m: Module) -> tuple[Stage, ...]:
     stage = composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting())
-    return stage, _make_blending_stage(m, _slant(reference.hits))
+    return stage, blending_stage(m, slant(reference.hits))
 
 
 PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {

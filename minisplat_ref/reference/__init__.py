@@ -13,6 +13,7 @@ extent               which pixels that ellipse can reach                        
 spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 3
 tiling               how ellipses are sorted, tile by tile, front to back            3DGS sec. 6
 hits                 how strongly an ellipse covers a pixel, and what it leaves      3DGS (3), (4)
+blend_stats          which ellipses matter to a pixel, and its median depth          Mini-Splatting sec. 3
 compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)
 removal              how much an image would change without one of the ellipses      LeCun et al. 1990
 depth                the depth of what a pixel shows, by two definitions             Mini-Splatting appendix D

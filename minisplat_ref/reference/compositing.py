@@ -4,24 +4,132 @@ This is 3DGS equation (3) with the hits of :mod:`hits`, each of weight ``w_g = a
 
     image = sum_g w_g c_g + T_end background,   alpha = 1 - T_end = sum_g w_g
 
-``composite_hits`` does that for any :class:`~minisplat_ref.reference.hits.Response`; ``composite`` is 3DGS's.
+``blend_tile`` is this equation for the pixels of a tile, and ``composite`` for an image. ``composite_hits`` is the same
+for any :class:`~minisplat_ref.reference.hits.Response`.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
-from minisplat_ref.reference.hits import CONIC, Response, goes_on, sort_by, tile_hits, undo_sort_by
+from minisplat_ref.constants import Conventions
+from minisplat_ref.reference.blend_stats import add_tile_stats, empty_stats, median_depths
+from minisplat_ref.reference.hits import CONIC, Response, Shading, TileHits, goes_on, tile_hits
 from minisplat_ref.types import (
     BlendGradient,
-    BlendStats,
     CompositeGradient,
     Floats,
     Projection,
     RenderOutput,
     TileBins,
 )
+
+
+def blend_tile(
+    tile: TileHits, colors: Floats, background: Floats, shading: Shading | None = None
+) -> tuple[Floats, Floats, Floats]:
+    """Blend the hits of a tile; this is 3DGS equation (3).
+
+    Parameters
+    ----------
+    tile : TileHits
+        G hits on P pixels.
+    colors : ndarray of shape (N, S)
+        D channels of each primitive, or the coefficients from which ``shading`` computes them.
+    background : ndarray of shape (D,)
+        Seen through the transmittance that is left.
+    shading : Shading, optional
+        Of primitives whose colours vary.
+
+    Returns
+    -------
+    image : ndarray of shape (P, D)
+        Colours of the pixels.
+    alpha : ndarray of shape (P,)
+        Accumulated opacity.
+    weights : ndarray of shape (G, P)
+        w.
+    """
+    T, T_end = tile.transmittances[:-1], tile.transmittances[-1]  # [G, P], [P]
+    weights = tile.alphas * T  # [G, P]
+    if shading is None:
+        light = weights.T @ colors[tile.ids]  # [P, D]
+    else:
+        light = np.einsum("gp,gpd->pd", weights, shading.shade(colors[tile.ids], tile.hit.place))
+    image = light + T_end[:, None] * background
+    alpha = 1 - T_end
+    return image, alpha, weights
+
+
+class TileGradient(NamedTuple):
+    """Gradient of :func:`blend_tile`."""
+
+    alphas: Floats  # [G, P] 0 where there is no hit
+    colors: Floats  # [G, S]
+    place: Any  # of the hits, None without a shading
+    background: Floats  # [D]
+
+
+def blend_tile_vjp(
+    tile: TileHits,
+    colors: Floats,
+    background: Floats,
+    shading: Shading | None,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> TileGradient:
+    """Gradient of :func:`blend_tile` with respect to what it blends.
+
+    For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative with respect to ``T_end`` is
+    ``v . background - v_alpha``. A hit contributes ``alpha_g T_g c_g`` and multiplies everything behind it by
+    ``1 - alpha_g``, therefore::
+
+        v_c_g        = w_g v
+        v_background = T_end v
+        behind_g     = sum_{j behind g} w_j (c_j . v) + T_end (v . background - v_alpha)
+        v_alpha_g    = T_g (c_g . v) - behind_g / (1 - alpha_g)
+
+    Parameters
+    ----------
+    tile, colors, background, shading
+        As for the forward function.
+    v_image : ndarray of shape (P, D)
+        Derivative with respect to the colours of the pixels.
+    v_alpha : ndarray of shape (P,)
+        Derivative with respect to the accumulated opacity.
+    """
+    alphas, T, T_end = tile.alphas, tile.transmittances[:-1], tile.transmittances[-1]
+    weights = alphas * T  # [G, P]
+    v_c, v_dot_c, v_place = light_gradient(tile, weights, colors, shading, v_image)
+    v_T_end = v_image @ background - v_alpha  # [P]
+    behind = _sum_behind(weights * v_dot_c) + T_end * v_T_end  # [G, P]
+    v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
+    return TileGradient(v_alphas, v_c, v_place, T_end @ v_image)
+
+
+def light_gradient(
+    tile: TileHits, weights: Floats, colors: Floats, shading: Shading | None, v: Floats
+) -> tuple[Floats, Floats, Any]:
+    """Return the gradient of ``sum_g w_g c_g`` with respect to colours [G, S], weights [G, P] and places.
+
+    ::
+
+        v_c_g = w_g v,   v_w_g = c_g . v
+
+    Parameters
+    ----------
+    tile, colors, shading
+        As for :func:`blend_tile`.
+    weights : ndarray of shape (G, P)
+        w.
+    v : ndarray of shape (P, D)
+        Derivative with respect to the sums.
+    """
+    c = colors[tile.ids]  # [G, S]
+    if shading is None:
+        return weights @ v, c @ v.T, None
+    v_c, v_place = shading.shade_vjp(c, tile.hit.place, weights[:, :, None] * v)
+    return v_c, np.einsum("gpd,pd->gp", shading.shade(c, tile.hit.place), v), v_place
 
 
 def composite_hits(
@@ -35,7 +143,7 @@ def composite_hits(
     with_stats: bool = False,
     with_median_depth: bool = False,
 ) -> RenderOutput:
-    """Blend the primitives of every tile, each pixel in the order of its response.
+    """Blend the primitives of every tile, front to back.
 
     Parameters
     ----------
@@ -44,7 +152,7 @@ def composite_hits(
     primitives : NamedTuple
         What ``response`` takes.
     colors : ndarray of shape (N, S)
-        D channels, or the coefficients from which ``response.shade`` computes them.
+        D channels, or the coefficients from which the response's shading computes them.
     background : ndarray of shape (D,)
         Seen through the transmittance that is left.
     bins : TileBins
@@ -59,36 +167,16 @@ def composite_hits(
     RenderOutput
         Image [H, W, D] and alpha [H, W], and what was asked for.
     """
-    height, width, n, dtype = bins.grid.height, bins.grid.width, len(colors), colors.dtype
-    image = np.empty((height, width, len(background)), dtype=dtype)
-    alpha = np.empty((height, width), dtype=dtype)
-    median_depth = np.zeros((height, width), dtype=dtype) if with_median_depth else None
-    stats = _no_hits(n, height, width, dtype) if with_stats else None
+    output = empty_output(colors, background, bins, with_stats, with_median_depth)
     for tile in tile_hits(primitives, bins, conventions, response):
-        ids, ys, xs, order = tile.ids, tile.ys, tile.xs, tile.order
-        weights = tile.alphas * undo_sort_by(order, tile.transmittances[:-1])  # [G, P]
-        transmittance = tile.transmittances[-1]  # [P]
-        if response.shade is None:
-            light = weights.T @ colors[ids]  # [P, D]
-        else:
-            light = np.einsum("gp,gpd->pd", weights, response.shade(colors[ids], tile.hit.place))
-        image[ys, xs] = light + transmittance[:, None] * background
-        alpha[ys, xs] = 1 - transmittance
-        if median_depth is not None and len(ids):
-            is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] true from the hit that crosses one half
-            crossing = np.argmax(is_beyond, axis=0)[None]
-            depths = sort_by(crossing, sort_by(order, tile.hit.depths))[0]
-            median_depth[ys, xs] = np.where(transmittance < MEDIAN_TRANSMITTANCE, depths, 0)
-        if stats is not None and len(ids):
-            stats.blend_weight_sum[ids] += weights.sum(axis=1)
-            stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
-            stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
-            heaviest = np.argmax(sort_by(order, weights), axis=0)  # of equals the first, which is in front
-            ids_in_order = sort_by(order, np.broadcast_to(ids[:, None], weights.shape))  # [G, P]
-            dominant = np.where(weights.max(axis=0) > 0, sort_by(heaviest[None], ids_in_order)[0], -1)
-            stats.dominant_ids[ys, xs] = dominant
-            np.add.at(stats.dominant_count, dominant[dominant >= 0], 1)
-    return RenderOutput(image, alpha, median_depth, stats)
+        pixels = tile.ys, tile.xs
+        output.image[pixels], output.alpha[pixels], weights = blend_tile(tile, colors, background, response.shading)
+        if output.median_depth is not None:
+            output.median_depth[pixels] = median_depths(tile)
+        if output.stats is not None and len(tile.ids):
+            heaviest = np.argmax(weights, axis=0)  # of equals the first, which is in front
+            add_tile_stats(output.stats, tile, weights, heaviest)
+    return output
 
 
 def composite_hits_vjp(
@@ -103,17 +191,8 @@ def composite_hits_vjp(
 ) -> BlendGradient:
     """Gradient of :func:`composite_hits` with respect to what it blends.
 
-    For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative with respect to ``T_end`` is
-    ``v . background - v_alpha``. A hit contributes ``alpha_g T_g c_g`` and multiplies everything behind it by
-    ``1 - alpha_g``, therefore::
-
-        v_c_g        = w_g v
-        v_background = T_end v
-        behind_g     = sum_{j behind g} w_j (c_j . v) + T_end (v . background - v_alpha)
-        v_alpha_g    = T_g (c_g . v) - behind_g / (1 - alpha_g)
-
-    The response's own derivatives do the rest, with ``v_alpha_g`` 0 where alpha was clamped. The skip, the stop and the
-    order are treated as fixed: the image jumps there and has no derivative.
+    It is that of :func:`blend_tile`, summed over the tiles: ``v_c_g = sum over pixels of w_g v``. The skip, the stop
+    and the order are treated as fixed: the image jumps there and has no derivative.
 
     Parameters
     ----------
@@ -130,35 +209,16 @@ def composite_hits_vjp(
         Zeros for primitives without hits.
     """
     v_image, v_alpha = v_output
-    v_fields = tuple(np.zeros_like(getattr(primitives, name)) for name in response.fields)
-    v_colors, v_background = np.zeros_like(colors), np.zeros_like(background)
+    sums = BlendGradient(
+        primitives=tuple(np.zeros_like(getattr(primitives, name)) for name in response.fields),
+        colors=np.zeros_like(colors),
+        background=np.zeros_like(background),
+    )
     for tile in tile_hits(primitives, bins, conventions, response):
-        ids, alphas, hit = tile.ids, tile.alphas, tile.hit
-        T = undo_sort_by(tile.order, tile.transmittances[:-1])  # [G, P]
-        T_end = tile.transmittances[-1]  # [P]
-        v, c = v_image[tile.ys, tile.xs], colors[ids]  # [P, D], [G, S]
-        weights, v_place = alphas * T, None  # [G, P]
-        if response.shade is None or response.shade_vjp is None:
-            v_colors[ids] += weights @ v
-            v_dot_c = c @ v.T  # [G, P] c_g . v
-        else:
-            v_c, v_place = response.shade_vjp(c, hit.place, weights[:, :, None] * v)
-            v_colors[ids] += v_c
-            v_dot_c = np.einsum("gpd,pd->gp", response.shade(c, hit.place), v)
-        v_background += T_end @ v
-
-        v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
-        in_front = sort_by(tile.order, weights * v_dot_c)
-        behind = undo_sort_by(tile.order, _sum_behind(in_front)) + T_end * v_T_end
-        v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
-
-        v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v_alphas)
-        v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v_alphas)
-        for v_field, v_rows in zip(
-            v_fields, response.hit_vjp(primitives, ids, hit, v_mean, v_shape, v_place), strict=True
-        ):
-            v_field[ids] += v_rows
-    return BlendGradient(v_fields, v_colors, v_background)
+        pixels = tile.ys, tile.xs
+        v = blend_tile_vjp(tile, colors, background, response.shading, v_image[pixels], v_alpha[pixels])
+        add_tile_gradient(sums, response, primitives, tile, conventions, v)
+    return sums
 
 
 def composite(
@@ -287,13 +347,53 @@ def composite_all_pairs(
     return image + T[:, :, None] * background, 1 - T
 
 
+def empty_output(
+    colors: Floats, background: Floats, bins: TileBins, with_stats: bool, with_median_depth: bool
+) -> RenderOutput:
+    """Return arrays for the image, alpha and what is asked for, to be filled tile by tile.
+
+    Parameters
+    ----------
+    colors, background, bins, with_stats, with_median_depth
+        As for :func:`composite_hits`; read for their sizes and dtypes.
+    """
+    shape, dtype = (bins.grid.height, bins.grid.width), colors.dtype
+    image, alpha = np.empty((*shape, len(background)), dtype), np.empty(shape, dtype)
+    median_depth = np.zeros(shape, dtype) if with_median_depth else None
+    return RenderOutput(image, alpha, median_depth, empty_stats(len(colors), shape, dtype) if with_stats else None)
+
+
+def add_tile_gradient(
+    sums: BlendGradient,
+    response: Response,
+    primitives: Any,
+    tile: TileHits,
+    conventions: Conventions,
+    v: TileGradient,
+) -> None:
+    """Add the gradient of a tile: that of the response, with ``v_alpha_g`` 0 where alpha was clamped.
+
+    Parameters
+    ----------
+    sums : BlendGradient
+        Is changed.
+    response, primitives, conventions
+        As for :func:`composite_hits`.
+    tile : TileHits
+        The hits.
+    v : TileGradient
+        From :func:`blend_tile_vjp`.
+    """
+    v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v.alphas)
+    v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v.alphas)
+    v_rows = response.hit_vjp(primitives, tile.ids, tile.hit, v_mean, v_shape, v.place)
+    for v_field, v_row in zip(sums.primitives, v_rows, strict=True):
+        v_field[tile.ids] += v_row
+    sums.colors[tile.ids] += v.colors
+    sums.background[:] += v.background
+
+
 def _sum_behind(terms: Floats) -> Floats:
     """Return for each row the sum [G, P] of the rows after it."""
     sums = np.cumsum(terms[::-1], axis=0)[::-1]  # [G, P] including the row itself
     return np.concatenate([sums[1:], np.zeros_like(terms[:1])])
-
-
-def _no_hits(n: int, height: int, width: int, dtype: np.dtype) -> BlendStats:
-    counts = np.zeros(n, dtype=np.int32)
-    dominant_ids = np.full((height, width), -1, dtype=np.int32)
-    return BlendStats(np.zeros(n, dtype), np.zeros(n, dtype), counts, counts.copy(), dominant_ids)

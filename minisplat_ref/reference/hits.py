@@ -5,22 +5,20 @@ These are 3DGS equations (3) and (4), the volume rendering of Max (1995) with on
     alpha_g = min(alpha_max, o_g exp(-d^T Q_g d / 2)),   d = p_g - pixel centre
     T_g = prod_{j before g} (1 - alpha_j)
 
-What a primitive does to a pixel is a :class:`Response`. That of 3DGS is ``CONIC``: here a Gaussian is a flat ellipse,
-and its 3D shape plays no part. Rays against 3D Gaussians, surfels, masks and pixel integrals are other responses.
+Here a Gaussian is a flat ellipse, and its 3D shape plays no part. What any primitive does to a pixel is a
+:class:`Response`; that of 3DGS is ``CONIC``. Rays against 3D Gaussians, surfels, masks and pixel integrals are other
+responses.
 
-A tile is one array with hits along the rows and pixels along the columns. A skipped hit has ``alpha_g = 0``, which
-changes no product and no sum. Hits are taken in the order of the tile's list, which is that of the means' depths; or
-each pixel sorts its own hits by their depths on its ray, all of them or those that fit a buffer (StopThePop, Radl et
-al. 2024).
+A tile is one array with hits along the rows and pixels along the columns. Hits are taken in the order of the tile's
+list, which is that of the means' depths. A skipped hit has ``alpha_g = 0``, which changes no product and no sum.
 """
 
-import heapq
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import LIST_ORDER, Conventions
+from minisplat_ref.constants import Conventions
 from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
 
@@ -28,40 +26,8 @@ class Hit(NamedTuple):
     """What G primitives do to P pixels."""
 
     unclamped: Floats  # [G, P] alpha before the clamp
-    depths: Floats  # [G, P] along the ray; only their order counts
+    depths: Floats  # [G, P] along the ray
     place: Any  # where inside the primitive, arrays [G, P, ...]: what colours and gradients depend on
-
-
-class Response(NamedTuple):
-    """What a primitive does to a pixel, and in which order a pixel takes its hits.
-
-    ``primitives`` are any bundle that the functions understand. Without ``shade`` a primitive has the same colour
-    everywhere, D numbers; with it, S coefficients become D channels at the place of the hit: a texture, spherical
-    harmonics on an ellipsoid, the depth on the ray. Places have to be finite even where a pixel misses the primitive.
-    """
-
-    boxes: Callable[[Any], Ints]
-    """[N, 4] half-open pixels x0, y0, x1, y1: nothing is hit elsewhere."""
-    hit: Callable[[Any, Ints, Floats], Hit]
-    """(primitives, ids [G], pixel centres [P, 2]) -> hits."""
-    hit_vjp: Callable[[Any, Ints, Hit, Floats, Floats, Any], tuple[Floats, ...]]
-    """(primitives, ids, hits, v_mean [G, P], v_shape [G, P], v_place) -> an array [G, ...] for each of ``fields``.
-
-    ``v_mean`` and ``v_shape`` both are the derivative with respect to ``unclamped``: the first for what moves the
-    primitive, the second for all else, because conventions may stop either at the clamp. ``v_place`` comes from
-    ``shade_vjp`` and is None without it.
-    """
-    fields: tuple[str, ...]
-    """Names of the fields of ``primitives`` that have a derivative."""
-    shade: Callable[[Floats, Any], Floats] | None = None
-    """(coefficients [G, S], place) -> channels [G, P, D]."""
-    shade_vjp: Callable[[Floats, Any, Floats], tuple[Floats, Any]] | None = None
-    """(coefficients, place, v [G, P, D]) -> (v_coefficients [G, S], v_place)."""
-    buffer_size: int = LIST_ORDER
-    """Size of each pixel's k-buffer: when it is full, the pixel takes the nearest of the hits in it.
-
-    ``LIST_ORDER`` = 1 takes hits in the order of the list, ``EXACT_ORDER`` buffers any number.
-    """
 
 
 class ConicPlace(NamedTuple):
@@ -138,8 +104,41 @@ def conic_hit_vjp(
     return v_means2d, v_conics, np.sum(falloffs * v_shape, axis=1)
 
 
+class Shading(NamedTuple):
+    """Colours that vary inside a primitive: a texture, spherical harmonics on an ellipsoid, the depth on the ray.
+
+    From S coefficients of a primitive they make D channels at the place of a hit. Places have to be finite even where a
+    pixel misses the primitive.
+    """
+
+    shade: Callable[[Floats, Any], Floats]
+    """(coefficients [G, S], place) -> channels [G, P, D]."""
+    shade_vjp: Callable[[Floats, Any, Floats], tuple[Floats, Any]]
+    """(coefficients, place, v [G, P, D]) -> (v_coefficients [G, S], v_place)."""
+
+
+class Response(NamedTuple):
+    """What a primitive does to a pixel. ``primitives`` are any bundle that the functions understand."""
+
+    boxes: Callable[[Any], Ints]
+    """[N, 4] half-open pixels x0, y0, x1, y1: nothing is hit elsewhere."""
+    hit: Callable[[Any, Ints, Floats], Hit]
+    """(primitives, ids [G], pixel centres [P, 2]) -> hits."""
+    hit_vjp: Callable[[Any, Ints, Hit, Floats, Floats, Any], tuple[Floats, ...]]
+    """(primitives, ids, hits, v_mean [G, P], v_shape [G, P], v_place) -> an array [G, ...] for each of ``fields``.
+
+    ``v_mean`` and ``v_shape`` both are the derivative with respect to ``unclamped``: the first for what moves the
+    primitive, the second for all else, because conventions may stop either at the clamp. ``v_place`` comes from
+    the shading and is None without one.
+    """
+    fields: tuple[str, ...]
+    """Names of the fields of ``primitives`` that have a derivative."""
+    shading: Shading | None = None
+    """None: a primitive has the same D channels everywhere."""
+
+
 CONIC = Response(conic_boxes, conic_hit, conic_hit_vjp, ("means2d", "conics", "opacities"))
-"""3DGS: a projected Gaussian of one colour, in the order of the list."""
+"""3DGS: a projected Gaussian of one colour."""
 
 
 class TileHits(NamedTuple):
@@ -151,8 +150,7 @@ class TileHits(NamedTuple):
     hit: Hit  # of all pixels, before the skip and the stop
     is_clamped: Bools  # [G, P] unclamped > alpha_max
     alphas: Floats  # [G, P] 0 where there is no hit
-    order: Ints | None  # [G, P] each pixel takes the primitive of row order[0] first; None: the order of the list
-    transmittances: Floats  # [G + 1, P] row r is T before the r-th that a pixel takes, the last row is T_end
+    transmittances: Floats  # [G + 1, P] row g is T_g, in front of hit g; the last row is T_end
 
 
 def tile_hits(
@@ -189,69 +187,15 @@ def tile_hits(
         x0, y0, x1, y1 = boxes[ids, :, None].swapaxes(0, 1)  # [G, 1] each
         is_hit = (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1) & (alphas >= conventions.alpha_min)
         alphas = np.where(is_hit, alphas, 0)
-        is_listed = response.buffer_size == LIST_ORDER
-        order = None if is_listed else blending_order(is_hit, hit.depths, response.buffer_size)
 
         # T never rises: once a hit would take it below the threshold, that hit and all behind it are left out.
-        in_order = sort_by(order, alphas)
-        in_order = np.where(goes_on(_transmittances(in_order)[1:], conventions), in_order, 0)
-        alphas, is_clamped = undo_sort_by(order, in_order), hit.unclamped > conventions.alpha_max
-        yield TileHits(ids, ys, xs, hit, is_clamped, alphas, order, _transmittances(in_order))
+        alphas = np.where(goes_on(transmit(alphas)[1:], conventions), alphas, 0)
+        is_clamped = hit.unclamped > conventions.alpha_max
+        yield TileHits(ids, ys, xs, hit, is_clamped, alphas, transmit(alphas))
 
 
-def blending_order(is_hit: Bools, depths: Floats, buffer_size: int) -> Ints:
-    """Return for each pixel the rows of its tile's list in the order in which it takes them.
-
-    A pixel reads the list into a buffer of ``buffer_size`` hits; whenever it is full, the pixel takes the nearest, of
-    equals the first. Primitives that miss the pixel take no room in the buffer.
-
-    Parameters
-    ----------
-    is_hit : ndarray of shape (G, P)
-        Which rows of the list hit which pixels; the other rows may come anywhere.
-    depths : ndarray of shape (G, P)
-        Along the pixel's ray.
-    buffer_size : int
-        ``LIST_ORDER`` to ``EXACT_ORDER``.
-
-    Returns
-    -------
-    ndarray of shape (G, P)
-        A permutation of the rows for each pixel.
-    """
-    n_rows, n_pixels = is_hit.shape
-    if buffer_size == LIST_ORDER:
-        return np.broadcast_to(np.arange(n_rows)[:, None], is_hit.shape)
-    if buffer_size >= n_rows:
-        return np.argsort(np.where(is_hit, depths, np.inf), axis=0, kind="stable")
-    order = np.empty((n_rows, n_pixels), dtype=int)
-    for pixel in range(n_pixels):
-        taken = np.flatnonzero(~is_hit[:, pixel]).tolist()
-        waiting: list[tuple[float, int]] = []
-        for row in np.flatnonzero(is_hit[:, pixel]).tolist():
-            heapq.heappush(waiting, (float(depths[row, pixel]), row))
-            if len(waiting) == buffer_size:
-                taken.append(heapq.heappop(waiting)[1])
-        order[:, pixel] = [*taken, *(row for _, row in sorted(waiting))]
-    return order
-
-
-def sort_by(order: Ints | None, values: Any) -> Any:
-    """Return ``values`` [G, P], given by rows of the list, in the pixels' own ``order`` [G, P], if they have one."""
-    return values if order is None else np.take_along_axis(values, order, axis=0)
-
-
-def undo_sort_by(order: Ints | None, values: Any) -> Any:
-    """Return ``values`` [G, P], given in the pixels' own ``order``, by rows of the list: undo :func:`sort_by`."""
-    if order is None:
-        return values
-    rows = np.empty_like(values)
-    np.put_along_axis(rows, order, values, axis=0)
-    return rows
-
-
-def _transmittances(alphas: Floats) -> Floats:
-    """Return T before each of G hits and after the last, [G + 1, P]: the running product of ``1 - alpha``."""
+def transmit(alphas: Floats) -> Floats:
+    """Return T before each of G hits ``alphas`` [G, P] and after the last, [G + 1, P]: products of ``1 - alpha``."""
     ones = np.ones_like(alphas, shape=(1, alphas.shape[1]))
     return np.cumprod(np.concatenate([ones, 1 - alphas]), axis=0)
 

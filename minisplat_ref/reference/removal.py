@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.reference.hits import CONIC, Response, sort_by, tile_hits, undo_sort_by
+from minisplat_ref.reference.hits import CONIC, Response, Shading, TileHits, tile_hits
 from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
 
 
@@ -62,7 +62,7 @@ def removal_changes_of_hits(
     conventions: Conventions,
     output: RenderOutput,
 ) -> Floats:
-    """Return the squared change of the image without each primitive, in the order in which pixels take their hits.
+    """Return the squared change of the image without each primitive.
 
     Parameters
     ----------
@@ -78,15 +78,17 @@ def removal_changes_of_hits(
     """
     changes = np.zeros(len(colors))
     for tile in tile_hits(primitives, bins, conventions, response):
-        alphas = sort_by(tile.order, tile.alphas)  # [G, P]
-        if response.shade is None:
-            c = np.broadcast_to(colors[tile.ids][:, None], (*alphas.shape, colors.shape[1]))
-        else:
-            c = response.shade(colors[tile.ids], tile.hit.place)
-        c = c if tile.order is None else np.take_along_axis(c, tile.order[:, :, None], axis=0)  # [G, P, D]
-        lights = (alphas * tile.transmittances[:-1])[:, :, None] * c  # w_g c_g
+        c = hit_colors(tile, colors, response.shading)  # [G, P, D]
+        lights = (tile.alphas * tile.transmittances[:-1])[:, :, None] * c  # w_g c_g
         B = output.image[tile.ys, tile.xs] - np.cumsum(lights, axis=0)
-        q = lights - (alphas / (1 - alphas))[:, :, None] * B
+        q = lights - (tile.alphas / (1 - tile.alphas))[:, :, None] * B
         squares = np.sum(q**2, axis=2, dtype=np.float64)  # [G, P]
-        changes[tile.ids] += undo_sort_by(tile.order, squares).sum(axis=1)
+        changes[tile.ids] += squares.sum(axis=1)
     return changes
+
+
+def hit_colors(tile: TileHits, colors: Floats, shading: Shading | None) -> Floats:
+    """Return the colour of each hit of a tile [G, P, D]; ``colors`` are coefficients where there is a ``shading``."""
+    if shading is not None:
+        return shading.shade(colors[tile.ids], tile.hit.place)
+    return np.broadcast_to(colors[tile.ids][:, None], (*tile.alphas.shape, colors.shape[1]))

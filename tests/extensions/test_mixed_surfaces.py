@@ -164,11 +164,11 @@ def test_the_gradient_of_the_response_with_depths(rng):
 
     def function(*args):
         found = response.hit(moved(*args), one, centers)
-        return found.unclamped, response.shade(colors, found.place)
+        return found.unclamped, response.shading.shade(colors, found.place)
 
     def vjp(v, v_channels):
         found = response.hit(footprints, one, centers)
-        _, v_depths = response.shade_vjp(colors, found.place, v_channels)
+        _, v_depths = response.shading.shade_vjp(colors, found.place, v_channels)
         return response.hit_vjp(footprints, one, found, v, v, v_depths)
 
     assert response.hit(footprints, one, centers).place.is_bounded.any()

@@ -20,9 +20,9 @@ from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_f
 from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
 from minisplat_ref.extensions.vr.stages import stages
 from minisplat_ref.io.ply import read_label
+from minisplat_ref.mechanisms.orders import blending_order
 from minisplat_ref.mechanisms.tangent.renderer import prepare, render
 from minisplat_ref.oracle.models import check_model_gradients
-from minisplat_ref.reference.hits import blending_order
 from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Model, view_from

@@ -9,7 +9,12 @@ import copy
 import inspect
 from types import SimpleNamespace
 
-DERIVATIVES = ("_vjp", "_jacobian", "_sum_behind")  # ends of the names of functions that only gradients use
+DERIVATIVES = (
+    "_vjp",
+    "_gradient",
+    "_jacobian",
+    "_sum_behind",
+)  # ends of the names of functions that only gradients use
 FIRST_OF = {"clip": 0, "sign": 0, "swapaxes": 0, "where": 1, "maximum": 0}  # np.f(...) becomes this argument of it
 
 

@@ -6,13 +6,15 @@ import pytest
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.geometry.stages import PIECES as GEOMETRY_PIECES
+from minisplat_ref.mechanisms import orders
 from minisplat_ref.oracle.differences import careful_derivative
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
-from minisplat_ref.oracle.pieces import PIECES, tiny_setting
+from minisplat_ref.oracle.pieces import PIECES, blending_stage, slant, tiny_setting
 from minisplat_ref.oracle.planted import PLANTED, plant
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
+from minisplat_ref.reference import hits
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import ProjectionGradient, TileGrid
 from mutants import mutants
@@ -156,7 +158,17 @@ EQUIVALENT = {
 }
 
 
-ALL_PIECES = {**PIECES, **GEOMETRY_PIECES}
+def sides_in_order(response, projection, bins):
+    tiles = orders.sort_hits(projection, bins, GSPLAT_MAIN, response)
+    return tuple(side for tile, order in tiles for side in (tile.alphas > 0, tile.is_clamped, order))
+
+
+def order_pieces(m):
+    """Pixels sort two hits at a time."""
+    return (blending_stage(m, orders.Sorted(slant(hits), buffer_size=2), sides_in_order),)
+
+
+ALL_PIECES = {**PIECES, **GEOMETRY_PIECES, orders: order_pieces}
 
 
 @pytest.mark.parametrize("module", ALL_PIECES, ids=lambda module: module.__name__.rpartition(".")[2])

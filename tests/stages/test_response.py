@@ -16,8 +16,10 @@ from minisplat_ref.cpu.compositing.responses import KernelResponse, conic_respon
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import load, maximum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
+from minisplat_ref.mechanisms import orders
+from minisplat_ref.mechanisms.orders import Sorted, blending_order
 from minisplat_ref.reference import compositing, removal
-from minisplat_ref.reference.hits import CONIC, Hit, Response, blending_order, tile_hits
+from minisplat_ref.reference.hits import CONIC, Hit, Response, Shading, tile_hits
 from minisplat_ref.rendering.backends import CPU, CPU_EXACT, PLAIN, REFERENCE
 from minisplat_ref.types import Floats, Ints, Projection, TileGrid
 from scenes import ALL_CONVENTIONS, activated, as_dtype, make_camera, make_gaussians
@@ -76,7 +78,7 @@ def ramp_shade_vjp(coefficients, place, v):
 
 
 FIELDS = ("means2d", "radii", "opacities")
-DOMES = Response(lambda domes: domes.boxes, dome_hit, dome_hit_vjp, FIELDS, ramp_shade, ramp_shade_vjp)
+DOMES = Response(lambda domes: domes.boxes, dome_hit, dome_hit_vjp, FIELDS, Shading(ramp_shade, ramp_shade_vjp))
 
 
 def dome_kernel_response():
@@ -149,6 +151,16 @@ def dome_case(rng, n, **changes):
     return Case((domes, colors, background, listed(domes), GSPLAT_MAIN), v_output)
 
 
+def reference(order, response=DOMES):
+    """The reference's functions and its response for an order: those of the core for the list's."""
+    return (compositing, response) if order == LIST_ORDER else (orders, Sorted(response, order))
+
+
+def with_order(package, order):
+    """The functions and the response for an order: the reference's, or the kernels'."""
+    return reference(order) if package is compositing else (package, KERNEL_DOMES._replace(buffer_size=order))
+
+
 def both_ways(package, response, case):
     """Image, alpha and every gradient."""
     output = package.composite_hits(response, *case.arguments)
@@ -199,15 +211,15 @@ def test_one_dome_by_hand():
 
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
 def test_gradient_of_the_reference_by_differences(order, rng):
-    case, response = dome_case(rng, 30), DOMES._replace(buffer_size=order)
+    case, (package, response) = dome_case(rng, 30), reference(order)
     domes, _, _, bins, conventions = case.arguments
 
     def draw(means2d, radii, opacities, colors, background):
         moved = domes._replace(means2d=means2d, radii=radii, opacities=opacities)
-        return compositing.composite_hits(response, moved, colors, background, bins, conventions)[:2]
+        return package.composite_hits(response, moved, colors, background, bins, conventions)[:2]
 
     inputs = [*(getattr(domes, name) for name in FIELDS), *case.arguments[1:3]]
-    got = both_ways(compositing, response, case)
+    got = both_ways(package, response, case)
     gradients = [got[name] for name in (*FIELDS, "colors", "background")]
     names = [*FIELDS, "colors", "background"]
     check_inner_products(draw, gradients, inputs, case.v_output, rng, names=names, step=GRADIENT_STEP_IMAGE)
@@ -219,7 +231,7 @@ def test_gradient_of_the_reference_by_differences(order, rng):
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
 def test_kernels_equal_the_reference(order, rng):
     case = dome_case(rng, 120)
-    expected = both_ways(compositing, DOMES._replace(buffer_size=order), case)
+    expected = both_ways(*reference(order), case)
     assert_same(both_ways(plain, KERNEL_DOMES._replace(buffer_size=order), case), expected, PARITY_FLOAT64)
 
 
@@ -230,7 +242,7 @@ def test_conventions_stop_gradients_at_the_clamp(conventions, order, rng):
     other = Case((*case.arguments[:4], conventions), case.v_output)
     results = []
     for arguments in (case, other):
-        expected = both_ways(compositing, DOMES._replace(buffer_size=order), arguments)
+        expected = both_ways(*reference(order), arguments)
         assert_same(both_ways(plain, KERNEL_DOMES._replace(buffer_size=order), arguments), expected, PARITY_FLOAT64)
         results.append(expected)
     (tile, *_) = tile_hits(case.arguments[0], case.arguments[3], GSPLAT_MAIN, DOMES)
@@ -304,7 +316,7 @@ def test_conics_are_in_order_already(order, rng):
             assert_array_equal(got[name], value)
         assert_allclose(got[name], value, rtol=0, atol=PARITY_FLOAT64 * np.abs(value).max(), err_msg=name)
     assert_array_equal(
-        compositing.composite_hits(CONIC._replace(buffer_size=order), *case.arguments).image,
+        orders.composite_hits(Sorted(CONIC, order), *case.arguments).image,
         compositing.composite(*case.arguments).image,
     )
 
@@ -333,33 +345,41 @@ def test_equal_depths_keep_the_order_of_the_list():
         assert_array_equal(blending_order(is_hit, depths, buffer_size)[:, 0], np.arange(6))
 
 
-@pytest.mark.parametrize(("package", "response"), [(compositing, DOMES), (plain, KERNEL_DOMES)], ids=["numpy", "numba"])
-def test_orders_meet(package, response, rng):
+def test_the_order_of_the_list_is_that_of_the_core(rng):
+    """To the byte: image, statistics, removal and every gradient."""
+    case = dome_case(rng, 60)
+    for function in (both_ways, statistics):
+        expected = function(compositing, DOMES, case)
+        for name, value in function(orders, Sorted(DOMES, LIST_ORDER), case).items():
+            assert_array_equal(value, expected[name], err_msg=name)
+
+
+@pytest.mark.parametrize("package", [compositing, plain], ids=["numpy", "numba"])
+def test_orders_meet(package, rng):
     """A buffer that holds all hits sorts exactly, smaller ones come near, and flat domes need no sorting."""
     case = dome_case(rng, 60)
-    images = {k: package.composite_hits(response._replace(buffer_size=k), *case.arguments).image for k in (1, 2, 8, 60)}
-    exact = package.composite_hits(response._replace(buffer_size=EXACT_ORDER), *case.arguments).image
+
+    def image(order, *arguments):
+        package_of_order, response = with_order(package, order)
+        return package_of_order.composite_hits(response, *arguments).image
+
+    images = {k: image(k, *case.arguments) for k in (1, 2, 8, 60)}
+    exact = image(EXACT_ORDER, *case.arguments)
     assert_array_equal(images[60], exact)
     errors = [np.abs(images[k] - exact).mean() for k in (1, 2, 8)]
     assert errors[0] > errors[1] > errors[2] and errors[0] > 1e-2
     flat = case.arguments[0]._replace(slopes=np.zeros((60, 2)))
-    in_order = [
-        package.composite_hits(response._replace(buffer_size=k), flat, *case.arguments[1:]).image
-        for k in (1, EXACT_ORDER)
-    ]
+    in_order = [image(k, flat, *case.arguments[1:]) for k in (1, EXACT_ORDER)]
     assert_array_equal(*in_order)
     assert np.abs(in_order[0] - images[1]).max() == 0  # depths matter to the order alone
     equal = flat._replace(depths=np.ones(60))  # and equal ones keep that of the list
     for k in (3, EXACT_ORDER):
-        image = package.composite_hits(response._replace(buffer_size=k), equal, *case.arguments[1:]).image
-        assert_array_equal(image, images[1])
+        assert_array_equal(image(k, equal, *case.arguments[1:]), images[1])
 
 
 def test_statistics_follow_the_order_of_the_pixel(rng):
     case = dome_case(rng, 60)
-    output = compositing.composite_hits(
-        DOMES._replace(buffer_size=EXACT_ORDER), *case.arguments, with_stats=True, with_median_depth=True
-    )
+    output = orders.composite_hits(Sorted(DOMES), *case.arguments, with_stats=True, with_median_depth=True)
     y, x = np.unravel_index(np.argmax(output.alpha), output.alpha.shape)
     hit = dome_hit(case.arguments[0], np.arange(60), np.array([[x + 0.5, y + 0.5]]))
     T, best, median = 1.0, (0.0, -1), 0.0
@@ -404,7 +424,7 @@ def test_hundreds_in_every_tile(order, rng):
     case = Case((domes, *case.arguments[1:]), case.v_output)
     bins = case.arguments[3]
     assert np.diff(bins.tile_offsets).min() > 200
-    expected = both_ways(compositing, DOMES._replace(buffer_size=order), case)
+    expected = both_ways(*reference(order), case)
     assert_same(both_ways(plain, KERNEL_DOMES._replace(buffer_size=order), case), expected, PARITY_FLOAT64)
 
 
@@ -423,10 +443,11 @@ def test_bytes_do_not_depend_on_threads(order, rng):
         assert value.tobytes() == results[1][name].tobytes() == results[2][name].tobytes(), name
 
 
-@pytest.mark.parametrize("name", ["composite_hits", "composite_hits_vjp"])
+@pytest.mark.parametrize("name", ["composite_hits", "composite_hits_vjp", "removal_changes_of_hits"])
 def test_twins_take_the_same_arguments(name):
-    of_book, of_kernels = (list(signature(getattr(m, name)).parameters) for m in (compositing, plain))
-    assert of_book == of_kernels
+    of_book = signature(getattr(compositing, name, None) or getattr(removal, name))
+    for twin in (plain, orders):
+        assert list(signature(getattr(twin, name)).parameters) == list(of_book.parameters)
 
 
 def test_plain_statistics_equal_those_of_the_tuned_kernels(rng):
@@ -456,7 +477,7 @@ def statistics(package, response, case):
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
 def test_statistics_of_kernels_equal_those_of_the_reference(order, rng):
     case = dome_case(rng, 120)
-    expected = statistics(compositing, DOMES._replace(buffer_size=order), case)
+    expected = statistics(*reference(order), case)
     got = statistics(plain, KERNEL_DOMES._replace(buffer_size=order), case)
     assert (expected["dominant_ids"] >= 0).mean() > 0.5 and (expected["median_depth"] > 0).mean() > 0.3
     for name in ("hit_count", "dominant_count", "dominant_ids"):
@@ -486,9 +507,8 @@ def test_statistics_by_hand(package):
         Projection(domes.means2d, *[order_of_list] * 4, domes.boxes), TileGrid(1, 1, 16, 16), GSPLAT_MAIN
     )
     arguments = domes, np.zeros((2, 3 * N_CHANNELS)), np.ones(N_CHANNELS), bins, GSPLAT_MAIN
-    listed_response = DOMES if package is compositing else KERNEL_DOMES
     for buffer_size, weights, dominant in ((LIST_ORDER, [0.5, 0.25], 0), (EXACT_ORDER, [0.25, 0.5], 1)):
-        got = statistics(package, listed_response._replace(buffer_size=buffer_size), Case(arguments, ()))
+        got = statistics(*with_order(package, buffer_size), Case(arguments, ()))
         assert_allclose(got["blend_weight_sum"], weights, rtol=CLOSED_FORM)
         assert_allclose(got["blend_weight_max"], weights, rtol=CLOSED_FORM)
         assert_array_equal(got["hit_count"], [1, 1])
@@ -500,12 +520,12 @@ def test_statistics_by_hand(package):
 
 
 def test_removal_is_what_rendering_without_each_changes(rng):
-    case, response = dome_case(rng, 12), DOMES._replace(buffer_size=EXACT_ORDER)
+    case, response = dome_case(rng, 12), Sorted(DOMES)
     domes, colors, background, bins, conventions = case.arguments
     open_ended = conventions._replace(transmittance_min=0.0)  # otherwise a pixel could take further hits
-    got = statistics(compositing, response, Case((*case.arguments[:4], open_ended), ()))["changes"]
-    whole = compositing.composite_hits(response, *case.arguments[:4], open_ended).image
+    got = statistics(orders, response, Case((*case.arguments[:4], open_ended), ()))["changes"]
+    whole = orders.composite_hits(response, *case.arguments[:4], open_ended).image
     for g in (0, 5, 11):
         gone = domes._replace(opacities=np.where(np.arange(12) == g, 0, domes.opacities))
-        image = compositing.composite_hits(response, gone, colors, background, bins, open_ended).image
+        image = orders.composite_hits(response, gone, colors, background, bins, open_ended).image
         assert_allclose(got[g], np.sum((image - whole) ** 2), rtol=1e-9)

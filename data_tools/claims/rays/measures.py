@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import show, table_of
 from data_tools.claims.rays import demo
-from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.rays.kernels import tree_of
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
@@ -18,8 +18,8 @@ from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
 from minisplat_ref.interface.palette import BLUE, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
+from minisplat_ref.mechanisms.orders import Sorted, composite_hits
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
-from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU, PLAIN, REFERENCE
@@ -74,7 +74,7 @@ def exact_order(gaussians: Gaussians, camera: Camera) -> Floats:
     def boxes(_: Any) -> Ints:
         return np.tile([0, 0, camera.width, camera.height], (len(offsets), 1))
 
-    response = Response(boxes, hit, lambda *_: (), (), buffer_size=EXACT_ORDER)
+    response = Sorted(Response(boxes, hit, lambda *_: (), ()))
     n, ids = len(offsets), np.arange(len(offsets), dtype=np.int32)
     grid = TileGrid(camera.width, camera.height, camera.width, camera.height)
     bins = TileBins(ids, np.array([0, n]), ids, np.arange(n + 1), grid)

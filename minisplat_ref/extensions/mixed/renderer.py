@@ -19,6 +19,7 @@ from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, foot
 from minisplat_ref.extensions.mixed.response import RESPONSE, HullFootprints
 from minisplat_ref.extensions.mixed.surfaces import SurfaceFootprints, surface_response
 from minisplat_ref.mechanisms.payload.renderer import (
+    Carried,
     Payload,
     PayloadGradient,
     Projected,
@@ -116,7 +117,14 @@ def _carry_vjp(
 
 
 FLAT_COLORS = Payload(
-    PLURAL, RESPONSE, response_for, _is_plain, _footprints, _footprints_vjp, listed=_list_boxes, channels=channels
+    PLURAL,
+    RESPONSE,
+    response_for,
+    _is_plain,
+    _footprints,
+    _footprints_vjp,
+    listed=_list_boxes,
+    carried=Carried(channels),
 )
 
 
@@ -129,8 +137,7 @@ def with_surfaces(layout: Layout) -> Payload:
         is_plain=lambda g: False,
         footprints=_surfaces,
         footprints_vjp=_surfaces_vjp,
-        carry=_carry,
-        carry_vjp=_carry_vjp,
+        carried=Carried(channels, _carry, _carry_vjp),
     )
 
 

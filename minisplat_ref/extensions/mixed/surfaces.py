@@ -16,7 +16,7 @@ import numpy as np
 from minisplat_ref.extensions.mixed import response
 from minisplat_ref.extensions.mixed.response import HullFootprints
 from minisplat_ref.mechanisms.payload.footprints import boxes_of
-from minisplat_ref.mechanisms.surfels.response import Layout, depth_shades
+from minisplat_ref.mechanisms.surfels.response import Layout, depth_shading
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.types import Bools, Floats, Ints
 
@@ -81,4 +81,4 @@ def hit_vjp(
 
 def surface_response(layout: Layout) -> Response:
     """Return the response of surfaces with the channels of a layout."""
-    return Response(boxes_of, hit, hit_vjp, FIELDS, *depth_shades(layout))
+    return Response(boxes_of, hit, hit_vjp, FIELDS, depth_shading(layout))

@@ -8,7 +8,7 @@ from minisplat_ref.extensions.textured.kernels import pad_textures, response_for
 from minisplat_ref.extensions.textured.population import TexturedGaussians, blank
 from minisplat_ref.extensions.textured.reference import visible_frames, visible_frames_vjp
 from minisplat_ref.extensions.textured.response import RESPONSE, TexturedFootprints, bounds
-from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
+from minisplat_ref.mechanisms.payload.renderer import Appearance, Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import FINE_TUNING as GS_FINE_TUNING
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
@@ -70,9 +70,7 @@ PAYLOAD = Payload(
     _is_plain,
     _footprints,
     _footprints_vjp,
-    _bound_logits,
-    _coefficients,
-    _coefficients_vjp,
+    appearance=Appearance(_bound_logits, _coefficients, _coefficients_vjp),
 )
 
 # Chosen between those of 3DGS for a colour's degree 0 and, 20 times less, for its higher degrees.

@@ -24,7 +24,7 @@ import numpy as np
 
 from minisplat_ref.extensions.textured.reference import Meeting, meet, meet_vjp
 from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
-from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response
+from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response, Shading
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
 from minisplat_ref.types import Floats, Ints
 
@@ -143,4 +143,4 @@ def _by_channel(coefficients: Floats, n_coefficients: int) -> Floats:
     return coefficients.reshape(len(coefficients), coefficients.shape[1] // n_coefficients, n_coefficients)
 
 
-RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS, shade, shade_vjp)
+RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS, Shading(shade, shade_vjp))

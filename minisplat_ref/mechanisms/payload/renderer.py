@@ -119,6 +119,29 @@ def carry_depths_vjp(footprints: Any, wants: frozenset[str], v_carried: Floats) 
     return np.ascontiguousarray(v_carried[:, 0]) if "depth" in wants else np.zeros_like(depths), ()
 
 
+class Appearance(NamedTuple):
+    """How opacities and colours are made of what a population stores; by default as in 3DGS."""
+
+    opacity_logits: Callable[[Any], Floats] = stored_logits
+    """Return the logits [N] of the opacities that are projected."""
+    coefficients: Callable[[Projected, Floats], Floats] = channels_alone
+    """Return what the response's shading takes, made of channels [N, D]: the colours, and a depth if asked for."""
+    coefficients_vjp: Callable[[Projected, Floats, int], tuple[Floats, Mapping[str, Floats]]] = channels_alone_vjp
+    """Return its gradient with respect to the D channels, and with respect to fields of the population."""
+
+
+class Carried(NamedTuple):
+    """The channels after RGB; by default the depth of the mean, where it is wanted."""
+
+    channels: Callable[[frozenset[str]], dict[str, slice]] = SPLATTING.channels
+    """Return all channels by name, as a renderer does."""
+    carry: Callable[[Any, frozenset[str]], Floats] = carry_depths
+    """Return those [N, K] that are the same in a whole footprint; 0 in those that the shading adds."""
+    carry_vjp: Callable[[Any, frozenset[str], Floats], tuple[Floats, tuple[Floats, ...]]] = carry_depths_vjp
+    """Return its gradient with respect to the projection's depths [N], and to fields of the footprints, which
+    ``footprints_vjp`` gets after those of the response."""
+
+
 class Payload(NamedTuple):
     """The functions in which an extension describes its Gaussians."""
 
@@ -134,21 +157,10 @@ class Payload(NamedTuple):
     """Return what the responses take. Its field ``projection`` says what is seen: the ellipses', or more or less."""
     footprints_vjp: Callable[[Projected, tuple[Floats, ...]], PayloadGradient]
     """Return the gradient of ``footprints`` for that of the response's fields after the conic's."""
-    opacity_logits: Callable[[Any], Floats] = stored_logits
-    """Return the logits [N] of the opacities that are projected."""
-    coefficients: Callable[[Projected, Floats], Floats] = channels_alone
-    """Return what the response's ``shade`` takes, made of channels [N, D]: the colours, and a depth if asked for."""
-    coefficients_vjp: Callable[[Projected, Floats, int], tuple[Floats, Mapping[str, Floats]]] = channels_alone_vjp
-    """Return its gradient with respect to the D channels, and with respect to fields of the population."""
     listed: Callable[[Any], Projection] = projection_alone
     """Return, of the footprints, by what tiles are listed: ellipses that hold all that is drawn, in their boxes."""
-    channels: Callable[[frozenset[str]], dict[str, slice]] = SPLATTING.channels
-    """Return the channels by name, as a renderer does."""
-    carry: Callable[[Any, frozenset[str]], Floats] = carry_depths
-    """Return the channels [N, K] after RGB that are the same in a whole footprint; 0 in those that ``shade`` adds."""
-    carry_vjp: Callable[[Any, frozenset[str], Floats], tuple[Floats, tuple[Floats, ...]]] = carry_depths_vjp
-    """Return its gradient with respect to the projection's depths [N], and to fields of the footprints, which
-    ``footprints_vjp`` gets after those of the response."""
+    appearance: Appearance = Appearance()
+    carried: Carried = Carried()
 
 
 class PayloadTape(NamedTuple):
@@ -164,7 +176,7 @@ class PayloadTape(NamedTuple):
 
 def payload_renderer(name: str, payload: Payload) -> Renderer:
     """Return the renderer of Gaussians with a payload."""
-    return Renderer(name, partial(render_payload, payload), render_payload_vjp, payload.channels)
+    return Renderer(name, partial(render_payload, payload), render_payload_vjp, payload.carried.channels)
 
 
 def render_payload(payload: Payload, model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
@@ -179,25 +191,25 @@ def render_payload(payload: Payload, model: Model, view: View, request: Request)
     if payload.is_plain(g):
         return SPLATTING.render(model, view, request)
     backend, conventions, dtype, camera = request.backend, request.conventions, g.means.dtype, view.camera
-    if missing := request.wants - payload.channels(request.wants).keys() - MEASURES:
+    if missing := request.wants - payload.carried.channels(request.wants).keys() - MEASURES:
         raise InputError(
             f"{payload.plural} are drawn without {', '.join(sorted(missing))}: train a recipe that does without"
         )
     sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
-    primitives = activate(g._replace(opacity_logits=payload.opacity_logits(g)), request.is_visible)
+    primitives = activate(g._replace(opacity_logits=payload.appearance.opacity_logits(g)), request.is_visible)
     projection = backend.project(*primitives, camera, conventions)
     projected = Projected(g, primitives, camera, conventions, backend, projection)
     footprints = payload.footprints(projected)
     listed = payload.listed(footprints)
     rgb = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, listed.radii)  # [N, 3]
-    carried = payload.carry(footprints, request.wants)  # [N, K]
+    carried = payload.carried.carry(footprints, request.wants)  # [N, K]
     channels = np.column_stack([rgb, carried.astype(dtype)])
     background = np.append(background, np.zeros(carried.shape[1], dtype))
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(listed, grid, conventions)
-    blended = footprints, payload.coefficients(projected, channels), background, bins
+    blended = footprints, payload.appearance.coefficients(projected, channels), background, bins
     blend = (
         partial(kernel_hits.composite_hits, payload.response_for(dtype))
         if backend.is_compiled
@@ -225,15 +237,15 @@ def render_payload_vjp(
     else:
         v = composite_hits_vjp(payload.response, *arguments)
     v_means2d, v_conics, v_opacities, *v_of_response = v.primitives
-    v_channels, v_fields = payload.coefficients_vjp(projected, v.colors, v_image.shape[2])
+    v_channels, v_fields = payload.appearance.coefficients_vjp(projected, v.colors, v_image.shape[2])
 
-    v_depths, v_of_carried = payload.carry_vjp(tape.blended[0], tape.wants, v_channels[:, 3:])
+    v_depths, v_of_carried = payload.carried.carry_vjp(tape.blended[0], tape.wants, v_channels[:, 3:])
     v_projection = ProjectionGradient(v_means2d, v_depths, v_conics, v_opacities)
     v_flat = backend.project_vjp(*primitives, camera, conventions, projection, v_projection)
     v_rgb = np.ascontiguousarray(v_channels[:, :3])
     v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_rgb)
     v_more = payload.footprints_vjp(projected, (*v_of_response, *v_of_carried))
-    logits, v_scales = payload.opacity_logits(g), v_flat.scales + v_more.scales
+    logits, v_scales = payload.appearance.opacity_logits(g), v_flat.scales + v_more.scales
     v_log_scales, v_logits = activate_vjp(primitives, logits, v_scales, v_flat.opacities)
     of_3dgs = {
         "means": v_flat.means + v_sh.means + v_more.means,

@@ -11,13 +11,12 @@ of the hit is that of the centre; elsewhere it is ``z = M_w . (u, v, 1)``. Where
 disc, and only the low-pass is left.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.mechanisms.surfels.projection import LOW_PASS, Surfels
-from minisplat_ref.reference.hits import Hit, Response
+from minisplat_ref.reference.hits import Hit, Response, Shading
 from minisplat_ref.types import Bools, Floats, Ints
 
 FIELDS = ("transforms", "means2d", "opacities", "depths")
@@ -130,11 +129,11 @@ def hit_vjp(
 
 def surfel_response(layout: Layout) -> Response:
     """Return the response of surfels with the channels of a layout."""
-    return Response(lambda surfels: surfels.boxes, hit, hit_vjp, FIELDS, *depth_shades(layout))
+    return Response(lambda surfels: surfels.boxes, hit, hit_vjp, FIELDS, depth_shading(layout))
 
 
-def depth_shades(layout: Layout) -> tuple[Callable[..., Floats], Callable[..., tuple[Floats, Floats]]]:
-    """Return the ``shade`` and ``shade_vjp`` of a response whose places have ``depths`` z [G, P] and a ``pivot``."""
+def depth_shading(layout: Layout) -> Shading:
+    """Return the shading of a response whose places have ``depths`` z [G, P] and a ``pivot``."""
 
     def shade(colors: Floats, place: Any) -> Floats:
         channels = np.broadcast_to(colors[:, None], (*place.depths.shape, colors.shape[1])).copy()
@@ -157,4 +156,4 @@ def depth_shades(layout: Layout) -> tuple[Callable[..., Floats], Callable[..., t
             v_depths -= v_q / place.depths**2
         return v.sum(axis=1), v_depths
 
-    return shade, shade_vjp
+    return Shading(shade, shade_vjp)

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
+from minisplat_ref.mechanisms.orders import blending_order
 from minisplat_ref.mechanisms.tangent.planes import hit, project
-from minisplat_ref.reference.hits import Hit, blending_order, conic_hit, goes_on
+from minisplat_ref.reference.hits import Hit, conic_hit, goes_on
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Primitives

@@ -8,6 +8,7 @@ import numpy as np
 from minisplat_ref.constants import EXACT_ORDER, Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms import orders
 from minisplat_ref.mechanisms.tangent.kernels import response_for
 from minisplat_ref.mechanisms.tangent.planes import (
     FootprintGradient,
@@ -17,9 +18,7 @@ from minisplat_ref.mechanisms.tangent.planes import (
     project,
     project_vjp,
 )
-from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.reference.removal import removal_changes_of_hits
 from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, lit_from_behind, parameters_vjp
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.rendering.splatting import append_depths
@@ -41,7 +40,7 @@ OF_STATS = frozenset({"stats", "surface", "dominant_depth"})
 """The outputs that need blend statistics."""
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
-"""The response of the reference, in the order of the list unless ``buffer_size`` is set."""
+"""The response of the reference."""
 
 
 class Prepared(NamedTuple):
@@ -73,7 +72,7 @@ class Prepared(NamedTuple):
         blend = (
             partial(kernel_hits.composite_hits, response_for(self.channels.dtype, self.buffer_size))
             if self.backend.is_compiled
-            else partial(composite_hits, RESPONSE._replace(buffer_size=self.buffer_size))
+            else partial(orders.composite_hits, orders.Sorted(RESPONSE, self.buffer_size))
         )
         return blend(*inputs, with_stats=bool(wants & OF_STATS), with_median_depth="median_depth" in wants)
 
@@ -84,7 +83,7 @@ class Prepared(NamedTuple):
         if self.backend.is_compiled:
             response = response_for(self.channels.dtype, self.buffer_size)
             return kernel_hits.removal_changes_of_hits(response, *inputs)
-        return removal_changes_of_hits(RESPONSE._replace(buffer_size=self.buffer_size), *inputs)
+        return orders.removal_changes_of_hits(orders.Sorted(RESPONSE, self.buffer_size), *inputs)
 
 
 class Tape(NamedTuple):
@@ -200,7 +199,7 @@ def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> Re
     if p.backend.is_compiled:
         v = kernel_hits.composite_hits_vjp(response_for(p.channels.dtype, p.buffer_size), *inputs)
     else:
-        v = composite_hits_vjp(RESPONSE._replace(buffer_size=p.buffer_size), *inputs)
+        v = orders.composite_hits_vjp(orders.Sorted(RESPONSE, p.buffer_size), *inputs)
     v_colors, v_background, v_depths = v.colors, v.background, np.zeros(len(v.colors))
     if p.has_depth:
         v_colors, v_depths = np.ascontiguousarray(v.colors[:, :-1]), v.colors[:, -1].astype(np.float64)
