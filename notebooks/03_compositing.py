@@ -405,7 +405,7 @@ assert np.allclose(weights @ colors[ids] + transmittances[-1] * background, outp
 assert ids[np.argmax(weights)] != ids[np.argmax(alphas)]
 assert output.stats.dominant_ids[pixel_y, pixel_x] == ids[np.argmax(weights)]
 
-assert len(blending) == 4  # the lines that are shown are still there
+assert len(blending) == 5  # the lines that are shown are still there
 
 # Tiles change no image: the same recursion over all Gaussians and all pixels gives the same.
 everything, alpha = composite_all_pairs(projection, colors, background, 80, 60, GSPLAT_MAIN)
