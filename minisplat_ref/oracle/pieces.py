@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref import reference, rendering
+from minisplat_ref import reference
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, Conventions
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting, make_setting
@@ -26,7 +26,7 @@ from minisplat_ref.oracle.stages import (
     with_module,
 )
 from minisplat_ref.reference.hits import CONIC, Hit, Response, Shading, tile_hits
-from minisplat_ref.rendering import splatting
+from minisplat_ref.rendering import renderer, splatting
 from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins, TileGrid
 
 Module = Any
@@ -235,6 +235,6 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.depth: depth_pieces,
     reference.loss: ssim_pieces,
     splatting: lambda m: tuple(splat_stage(with_module(), tiny_setting(), m, with_depth=d) for d in (False, True)),
-    rendering: lambda m: (render_stage(with_module(), tiny_setting(), m),),
+    renderer: lambda m: (render_stage(with_module(), tiny_setting(), m),),
 }
 """Every module with gradients, and the stages that its functions are tested in."""

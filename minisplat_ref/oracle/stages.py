@@ -8,13 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref import rendering
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.differences import Function, Point, Vjp
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
-from minisplat_ref.rendering import splatting
+from minisplat_ref.rendering import renderer, splatting
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import (
     Camera,
@@ -203,12 +202,12 @@ def splat_stage(backend: Backend, setting: Setting, module: object = splatting, 
     )
 
 
-def render_stage(backend: Backend, setting: Setting, module: object = rendering) -> Stage:
+def render_stage(backend: Backend, setting: Setting, module: object = renderer) -> Stage:
     """Return ``render`` with depth as a function of every trained parameter, background and pose."""
     gaussians, camera, background, conventions = setting
     inputs = {**gaussians._asdict(), "background": background, **setting.pose}
 
-    def tape_of(*args: Floats) -> rendering.RenderTape:
+    def tape_of(*args: Floats) -> renderer.RenderTape:
         *parameters, background, R, t = args
         _, tape = module.render(  # type: ignore[attr-defined]
             Gaussians(*parameters),

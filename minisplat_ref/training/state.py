@@ -95,7 +95,7 @@ class Iteration(NamedTuple):
     """Tells the user something in one line, at once; a note for the record alone is returned instead."""
     fetch: Callable[[], Any] = lambda: None
     """Copies parameters and moments into the state, where a GPU has newer ones. Only actions whose event does not read
-    parameters (:attr:`During.reads_parameters <minisplat_ref.training.schedule.During>`) need it."""
+    parameters (``reads_parameters`` of :class:`minisplat_ref.training.schedule.During`) need it."""
 
 
 class FiredEvent(NamedTuple):
