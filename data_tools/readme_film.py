@@ -21,7 +21,7 @@ from PIL import Image
 
 from data_tools.readme_figure import DOCS
 from minisplat_ref.app.reports.images import to_8_bits
-from minisplat_ref.app.runs.source import Source, open_source
+from minisplat_ref.app.runs.model_source import Source, open_source
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import replacing

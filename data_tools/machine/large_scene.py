@@ -19,7 +19,7 @@ import numpy as np
 
 from data_tools.machine.process_memory import bytes_in_use, forget_peak, peak
 from minisplat_ref import memory
-from minisplat_ref.app.runs import room
+from minisplat_ref.app.runs import memory_needs
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run import Training, run_training
 from minisplat_ref.app.runs.settings import load_photographs, recipe_of
@@ -153,7 +153,7 @@ def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
     scene = load_photographs(settings)
     before = bytes_in_use()
     state = initial_state(scene, recipe, settings.seed) if n is None else _state(scene, n)
-    needs = room.foresee(scene, state, GSPLAT_MAIN, CPU)
+    needs = memory_needs.foresee(scene, state, GSPLAT_MAIN, CPU)
     out.mkdir()
     run_training(Training(out, scene, settings, recipe, state))
     return {"foreseen": needs.at_the_peak, "peak": peak() - before, "process": peak(), "n_gaussians": needs.n_rows}

@@ -8,7 +8,7 @@ from PIL import Image
 from data_tools import readme_film
 from data_tools.readme_film import divided, film, write
 from minisplat_ref.app.cli import main
-from minisplat_ref.app.runs.source import open_source
+from minisplat_ref.app.runs.model_source import open_source
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError

@@ -15,6 +15,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.extensions.analytic.gradient_checks import stages
 from minisplat_ref.extensions.analytic.method import INTEGRATED
 from minisplat_ref.extensions.analytic.reference import (
     EXACT_RESPONSE,
@@ -26,7 +27,6 @@ from minisplat_ref.extensions.analytic.reference import (
     integrals,
     integrals_vjp,
 )
-from minisplat_ref.extensions.analytic.stages import stages
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE

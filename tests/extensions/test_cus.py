@@ -15,6 +15,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cus import bank, maps
 from minisplat_ref.extensions.cus.decoding import decode
+from minisplat_ref.extensions.cus.gradient_checks import N_CHANNELS, small, stages
 from minisplat_ref.extensions.cus.losses import (
     anchor_scale,
     blended_queries,
@@ -30,7 +31,6 @@ from minisplat_ref.extensions.cus.method import (
     significance,
 )
 from minisplat_ref.extensions.cus.population import CAMERAS, Anchors, as_anchors
-from minisplat_ref.extensions.cus.stages import N_CHANNELS, small, stages
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image

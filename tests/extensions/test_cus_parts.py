@@ -10,11 +10,11 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cus import maps
 from minisplat_ref.extensions.cus.decoding import decode, decode_vjp
+from minisplat_ref.extensions.cus.gradient_checks import small
 from minisplat_ref.extensions.cus.growth import grow_anchors
 from minisplat_ref.extensions.cus.losses import blended_queries, feature_loss, read_memory
 from minisplat_ref.extensions.cus.method import ANCHORS, prune_insignificant
 from minisplat_ref.extensions.cus.population import CAMERAS, MEMORY, UNITS, as_anchors
-from minisplat_ref.extensions.cus.stages import small
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.features.filters import CLASSICAL

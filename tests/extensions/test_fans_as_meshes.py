@@ -17,6 +17,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.fans.gradient_checks import stages
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans, write_mesh
 from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, keep_in_range, prune_faint_fans, render, render_vjp
 from minisplat_ref.extensions.fans.shapes import (
@@ -29,7 +30,6 @@ from minisplat_ref.extensions.fans.shapes import (
     vertices_of,
     visible_mesh,
 )
-from minisplat_ref.extensions.fans.stages import stages
 from minisplat_ref.extensions.fans.tuning import alpha_of, best_shape, render_clipped
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.gbuffer.tone import tone

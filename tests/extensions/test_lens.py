@@ -16,8 +16,8 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.lens.gradient_checks import OPTICS, stages
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
-from minisplat_ref.extensions.lens.stages import OPTICS, stages
 from minisplat_ref.io import load_scene, viewpoints
 from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.models import model_of

@@ -17,6 +17,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.lucas_kanade import losses, pyramid
+from minisplat_ref.extensions.lucas_kanade.gradient_checks import stages
 from minisplat_ref.extensions.lucas_kanade.losses import depth_order, flow, next_view, ordered_pairs, rendered_flow
 from minisplat_ref.extensions.lucas_kanade.method import WARPED, first_warp
 from minisplat_ref.extensions.lucas_kanade.moving import CENTERS, GROWTHS, LOG_WIDTH, SHIFTS, TURNS, moved
@@ -32,7 +33,6 @@ from minisplat_ref.extensions.lucas_kanade.reference import (
     turned,
     turned_vjp,
 )
-from minisplat_ref.extensions.lucas_kanade.stages import stages
 from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import save_ply

@@ -10,11 +10,11 @@ from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.planes import KAPPA, Planes, planes_of, planes_vjp
 from minisplat_ref.extensions.mixed.population import as_ellipses
 from minisplat_ref.extensions.mixed.projection import Hulls, in_plane
-from minisplat_ref.extensions.mixed.stages import of_all_kinds
 from minisplat_ref.extensions.mixed.surfaces import FIELDS, SurfaceFootprints, surface_response
 from minisplat_ref.mechanisms.surfels.losses import distortion
 from minisplat_ref.mechanisms.surfels.response import Layout

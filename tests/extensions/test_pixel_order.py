@@ -20,8 +20,8 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe, load_extension
+from minisplat_ref.extensions.pixel_order.gradient_checks import stages
 from minisplat_ref.extensions.pixel_order.method import ORDERED
-from minisplat_ref.extensions.pixel_order.stages import stages
 from minisplat_ref.mechanisms.tangent import planes as planes
 from minisplat_ref.mechanisms.tangent.rays import color_changes, orbit_camera, tangent_hits, yaw_camera
 from minisplat_ref.mechanisms.tangent.renderer import RESPONSE

@@ -18,10 +18,10 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons import reference
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
+from minisplat_ref.extensions.polygons.gradient_checks import stages
 from minisplat_ref.extensions.polygons.kernels import TRIANGLE, fans_of
 from minisplat_ref.extensions.polygons.kernels import tree_of as triangle_tree
 from minisplat_ref.extensions.polygons.method import LOG_THICKNESS, TRACED, press_flat, tracer_for
-from minisplat_ref.extensions.polygons.stages import stages
 from minisplat_ref.mechanisms.meshes.fans import opacity_radii, rims
 from minisplat_ref.mechanisms.rays import kernels
 from minisplat_ref.mechanisms.rays.blending import sum_by_row

@@ -22,8 +22,8 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import reference
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
+from minisplat_ref.extensions.rays.gradient_checks import stages
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
-from minisplat_ref.extensions.rays.stages import stages
 from minisplat_ref.mechanisms.rays import bvh as bvh
 from minisplat_ref.mechanisms.rays.blending import sum_by_row
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays, pixel_rays_vjp

@@ -12,10 +12,10 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite import affine_fit, reference, rpc, utm
+from minisplat_ref.extensions.satellite.gradient_checks import stages
 from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
 from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference, hold_sky
 from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
-from minisplat_ref.extensions.satellite.stages import stages
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
 from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.pieces import tiny_setting

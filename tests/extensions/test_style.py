@@ -16,6 +16,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.style import method, run_files
+from minisplat_ref.extensions.style.gradient_checks import stages
 from minisplat_ref.extensions.style.reference import (
     FeatureWeights,
     feature_loss,
@@ -27,7 +28,6 @@ from minisplat_ref.extensions.style.reference import (
     unit_rows,
 )
 from minisplat_ref.extensions.style.splitting import areas, children_of, cut_stretch, largest, split, split_large
-from minisplat_ref.extensions.style.stages import stages
 from minisplat_ref.extensions.style.styling import read_style, recolor
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.features.filters import CLASSICAL

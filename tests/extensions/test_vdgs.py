@@ -15,6 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.vdgs import modes
+from minisplat_ref.extensions.vdgs.gradient_checks import MODES, small_shared, stages
 from minisplat_ref.extensions.vdgs.method import (
     CENTER,
     NAME,
@@ -31,7 +32,6 @@ from minisplat_ref.extensions.vdgs.reference import (
     modulated_logits,
     modulated_logits_vjp,
 )
-from minisplat_ref.extensions.vdgs.stages import MODES, small_shared, stages
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.mechanisms.networks.directions import directions, directions_vjp
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY

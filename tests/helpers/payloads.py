@@ -6,17 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.cuts.curve import evaluate_cuts_vjp
+from minisplat_ref.extensions.cuts.gradient_checks import stages as cuts_stages
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
-from minisplat_ref.extensions.cuts.stages import stages as cuts_stages
+from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds
+from minisplat_ref.extensions.mixed.gradient_checks import stages as mixed_stages
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import as_ellipses
 from minisplat_ref.extensions.mixed.projection import in_plane_vjp
-from minisplat_ref.extensions.mixed.stages import of_all_kinds
-from minisplat_ref.extensions.mixed.stages import stages as mixed_stages
+from minisplat_ref.extensions.textured.gradient_checks import stages as textured_stages
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import with_textures
 from minisplat_ref.extensions.textured.reference import meet_vjp
-from minisplat_ref.extensions.textured.stages import stages as textured_stages
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Gaussians, Model

@@ -14,7 +14,7 @@ import pytest
 from minisplat_ref import memory
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.comparison.crops import choose_crops
-from minisplat_ref.app.runs import fingerprint, room, run_folder
+from minisplat_ref.app.runs import fingerprint, memory_needs, run_folder
 from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
@@ -382,7 +382,7 @@ def test_growing_gaussians_take_the_room_of_photographs(scene, monkeypatch):
 def test_what_is_foreseen(original, few):
     loaded = load_scene(original, test_every=4)
     state = initial_state(loaded, get_recipe("3dgs-accel"), 0)
-    needs = room.foresee(loaded, state, GSPLAT_MAIN, CPU)
+    needs = memory_needs.foresee(loaded, state, GSPLAT_MAIN, CPU)
     assert (needs.n_rows, needs.n_pixels) == (len(state.gaussians.means), PHOTO_BYTES / 3)
     assert needs.kept_bytes == pytest.approx(2.5 * PHOTO_BYTES)
     assert needs.reading_bytes == (2 * 3 + 10) * PHOTO_BYTES / 3
@@ -398,14 +398,14 @@ def test_pairs_are_foreseen(enlarged):
     made = made._replace(train_views=tuple(map(view_from, cameras)))
     state = initial_state(made, get_recipe("3dgs-accel"), 0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room, "N_SAMPLED", 400)
-        foreseen = room.foresee(made, state, GSPLAT_MAIN, CPU).n_pairs
+        patch.setattr(memory_needs, "N_SAMPLED", 400)
+        foreseen = memory_needs.foresee(made, state, GSPLAT_MAIN, CPU).n_pairs
     request = Request(made.background)
     n_pairs = max(SPLATTING.render(state.model, view, request)[0].n_pairs for view in made.train_views)
     # The mean over all places of the tiles is 0.05 to 0.12 above what scenes at hand have; a sample adds its chance.
     assert foreseen == pytest.approx(n_pairs, rel=0.2)
     few = state.gaussians._make(field[:0] for field in state.gaussians)
-    assert room.foresee(made, replace(state, gaussians=few), GSPLAT_MAIN, CPU).n_pairs == 0
+    assert memory_needs.foresee(made, replace(state, gaussians=few), GSPLAT_MAIN, CPU).n_pairs == 0
 
 
 def test_a_context_that_reads_ahead_forgets_what_is_not_needed(few):

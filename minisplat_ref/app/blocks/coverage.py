@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.app.blocks.grid import Block
-from minisplat_ref.app.runs.part import Plane
+from minisplat_ref.app.runs.scene_part import Plane
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.frames import return_points
 from minisplat_ref.rendering import RenderSettings

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.runs.part import Box, Plane
+from minisplat_ref.app.runs.scene_part import Box, Plane
 from minisplat_ref.errors import InputError
 from minisplat_ref.types import Floats
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from minisplat_ref.app.blocks.plan import Plan
 from minisplat_ref.app.reports.plots import plot, save_png
-from minisplat_ref.app.runs.part import Box
+from minisplat_ref.app.runs.scene_part import Box
 from minisplat_ref.interface.palette import TITLE_COLOR
 from minisplat_ref.types import Floats
 

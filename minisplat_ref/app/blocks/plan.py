@@ -24,7 +24,7 @@ from minisplat_ref.app.blocks.grid import Block, divide, ground_plane
 from minisplat_ref.app.listing_file import select
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.options import Settings
-from minisplat_ref.app.runs.part import Part, Plane, Region, box_from_json
+from minisplat_ref.app.runs.scene_part import Part, Plane, Region, box_from_json
 from minisplat_ref.app.runs.scoring import renderer_of
 from minisplat_ref.app.runs.settings import load, load_model, recipe_of
 from minisplat_ref.constants import PROFILES

@@ -168,7 +168,7 @@ def _report(plan: "Plan", scene: "Scene") -> None:
     from minisplat_ref.app.comparison.table import table_cells
     from minisplat_ref.app.reports.plots import save_png
     from minisplat_ref.app.runs import run_folder
-    from minisplat_ref.app.runs.fired import HEADING, remarks, rows
+    from minisplat_ref.app.runs.recipe_actions import HEADING, remarks, rows
     from minisplat_ref.interface.reporting import markdown_table
 
     results = collect(plan, scene)

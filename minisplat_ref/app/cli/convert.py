@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _write_page(args: argparse.Namespace) -> int:
     """Write the model as a page that shows it, and say how to open it."""
-    from minisplat_ref.app.runs.source import open_source
+    from minisplat_ref.app.runs.model_source import open_source
     from minisplat_ref.app.viewer.page import write_page
     from minisplat_ref.io.formats import write_content
     from minisplat_ref.rendering import SPLATTING

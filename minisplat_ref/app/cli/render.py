@@ -23,7 +23,7 @@ from minisplat_ref.interface.progress import with_progress
 
 if TYPE_CHECKING:
     from minisplat_ref.app.runs.cluster import Workers
-    from minisplat_ref.app.runs.source import Source
+    from minisplat_ref.app.runs.model_source import Source
     from minisplat_ref.io.viewpoints import Viewpoint
 
 DESCRIPTION = """\
@@ -104,8 +104,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.reports.images import depth_image, depth_range
     from minisplat_ref.app.runs.cluster import Workers
     from minisplat_ref.app.runs.first_use import warn_if_not_kept
+    from minisplat_ref.app.runs.model_source import open_source
     from minisplat_ref.app.runs.notices import warn_of_model
-    from minisplat_ref.app.runs.source import open_source
     from minisplat_ref.io import write_image
     from minisplat_ref.io.names import file_names
     from minisplat_ref.mechanisms.gbuffer.maps import map_image
@@ -230,7 +230,7 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
 
 
 def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint]":
-    from minisplat_ref.app.runs.source import place_viewpoints
+    from minisplat_ref.app.runs.model_source import place_viewpoints
     from minisplat_ref.io import orbits, viewpoints
 
     which: str = args.cameras or ("test" if source.cameras else "orbit")

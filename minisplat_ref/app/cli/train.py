@@ -235,7 +235,7 @@ def _default_iterations(name: str) -> int:
 
 def _first_state(settings: Settings, scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from what --init gives."""
-    from minisplat_ref.app.runs.part import read_region
+    from minisplat_ref.app.runs.scene_part import read_region
     from minisplat_ref.app.runs.start import start_from
 
     start = start_from(settings.init, scene, recipe, settings.seed)
@@ -294,11 +294,12 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
 def _check_room(scene: "Scene", state: "TrainState", settings: Settings) -> str:
     """Say what the training takes of memory; refuse one that does not fit."""
     from minisplat_ref import memory
-    from minisplat_ref.app.runs import room
+    from minisplat_ref.app.runs import memory_needs
     from minisplat_ref.constants import PROFILES
     from minisplat_ref.rendering.backends import get_backend
 
-    return memory.check_start(room.foresee(scene, state, PROFILES[settings.profile], get_backend(settings.backend)))
+    needs = memory_needs.foresee(scene, state, PROFILES[settings.profile], get_backend(settings.backend))
+    return memory.check_start(needs)
 
 
 def _how_it_goes_on(state: "TrainState", settings: Settings, is_rescaled: bool) -> str:

@@ -61,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
     """Serve the scene until Ctrl-C."""
     from minisplat_ref.app.film import check_film
     from minisplat_ref.app.runs.first_use import warn_if_not_kept
+    from minisplat_ref.app.runs.model_source import open_source
     from minisplat_ref.app.runs.notices import warn_of_model
-    from minisplat_ref.app.runs.source import open_source
     from minisplat_ref.app.viewer.browser import Content, Viewer, address, open_server, serve
     from minisplat_ref.app.viewer.photographs import load_thumbnails
 

@@ -30,7 +30,7 @@ from minisplat_ref.app.reports.page import (
     table,
 )
 from minisplat_ref.app.reports.plots import to_svg
-from minisplat_ref.app.runs.fired import Fired
+from minisplat_ref.app.runs.recipe_actions import Fired
 from minisplat_ref.app.runs.report_parts import fired_tables
 from minisplat_ref.datasets.synthetic.surface import NEAR, OPACITY_MIN
 from minisplat_ref.types import Scene

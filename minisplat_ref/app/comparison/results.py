@@ -20,7 +20,7 @@ from minisplat_ref.app.comparison.plan import Plan, scene_of
 from minisplat_ref.app.comparison.speed import render_rates
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
-from minisplat_ref.app.runs.fired import Fired
+from minisplat_ref.app.runs.recipe_actions import Fired
 from minisplat_ref.app.runs.scoring import load_trained
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.reporting import describe_machine

@@ -2,14 +2,14 @@
 
 The command ``train``
     :mod:`.options` (the declaration of every setting), :mod:`.settings` (the requested settings in ``config.json``, and
-    the recipe, photographs and model that they mean), :mod:`.proposed_size` and :mod:`.room` (the size that fits into
-    memory), :mod:`.start` (points to start from), :mod:`.run_folder` (makes the folder; the names of its files),
-    :mod:`.run` (the training), :mod:`.first_use` (compiles the kernels ahead), :mod:`.checkpoints` (the last two, and
-    the newest model), :mod:`.fingerprint` (identifies the scene of the run).
+    the recipe, photographs and model that they mean), :mod:`.proposed_size` and :mod:`.memory_needs` (the size that
+    fits into memory), :mod:`.start` (points to start from), :mod:`.run_folder` (makes the folder; the names of its
+    files), :mod:`.run` (the training), :mod:`.first_use` (compiles the kernels ahead), :mod:`.checkpoints` (the last
+    two, and the newest model), :mod:`.fingerprint` (identifies the scene of the run).
 
 Several runs at once
     :mod:`.cluster` (connect to workers, check them, hand out), :mod:`.worker` (the worker's side of a job),
-    :mod:`.attached` (its command, which ends with it).
+    :mod:`.attached_process` (its command, which ends with it).
 
 Records of a run
     :mod:`.progress` (bar and ``log.jsonl``), :mod:`.events` (mechanisms that fired, ``events.jsonl``), :mod:`.curve`
@@ -29,6 +29,6 @@ A smaller model: the command ``simplify``
     and :mod:`.simplified_run` (the new folder).
 
 Its reports
-    :mod:`.run_report`, :mod:`.demo_report`, :mod:`.simplification_report`, of :mod:`.report_parts`, :mod:`.fired`
-    (the mechanisms that acted) and :mod:`.decisions_report` (decisions of ``adaptive``).
+    :mod:`.run_report`, :mod:`.demo_report`, :mod:`.simplification_report`, of :mod:`.report_parts`,
+    :mod:`.recipe_actions` (the mechanisms that acted) and :mod:`.decisions_report` (decisions of ``adaptive``).
 """

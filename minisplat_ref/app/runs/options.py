@@ -139,7 +139,7 @@ class Settings:
     ] = None
     """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
     block: Annotated[str | None, Option(HIDDEN, "PART", _absolute)] = None
-    """Absolute path of the part of the scene, a :class:`~minisplat_ref.app.runs.part.Part`; None for the whole."""
+    """Absolute path of a part of the scene, a :class:`~minisplat_ref.app.runs.scene_part.Part`; None for the whole."""
     fold: Annotated[int, Option(HIDDEN, "N", integer(0))] = 0
     """Offset of the first held-out photograph, below ``test_every``: one fold of a cross-validation."""
 

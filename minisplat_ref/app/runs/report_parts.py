@@ -6,7 +6,7 @@ from typing import Any
 from minisplat_ref.app.reports.images import Image8
 from minisplat_ref.app.reports.page import add_caption, panel, slider, table
 from minisplat_ref.app.reports.plots import plot, to_svg
-from minisplat_ref.app.runs.fired import HEADING, Fired, remarks_by_mechanism, rows
+from minisplat_ref.app.runs.recipe_actions import HEADING, Fired, remarks_by_mechanism, rows
 from minisplat_ref.interface.palette import BLUE, GREEN, RED
 
 ERROR_TEXT = """\

@@ -11,10 +11,10 @@ from minisplat_ref.app.reports.page import add_caption, cards, code, curves, fol
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.decisions_report import decisions_section
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
-from minisplat_ref.app.runs.fired import Fired
 from minisplat_ref.app.runs.next_steps import ways_to_look
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import read_log
+from minisplat_ref.app.runs.recipe_actions import Fired
 from minisplat_ref.app.runs.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
 from minisplat_ref.app.runs.settings import load
 from minisplat_ref.extensions.extension import find_recipe

@@ -12,8 +12,8 @@ import numpy as np
 from minisplat_ref import __version__
 from minisplat_ref.app.runs.model_file import label_for
 from minisplat_ref.app.runs.options import FIRST_NAMES, NAMES, Settings, first_wrong
-from minisplat_ref.app.runs.part import read_part
 from minisplat_ref.app.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
+from minisplat_ref.app.runs.scene_part import read_part
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
 from minisplat_ref.io import list_scene

@@ -25,7 +25,7 @@ from minisplat_ref.app.runs.run_folder import hold_folder
 from minisplat_ref.errors import InputError
 
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-ATTACHED = (sys.executable, "-m", "minisplat_ref.app.runs.attached")
+ATTACHED = (sys.executable, "-m", "minisplat_ref.app.runs.attached_process")
 COMPILE = "from minisplat_ref.app.runs.first_use import compile_kernels; compile_kernels('cpu')"
 POLL_SECONDS = 0.5  # between looks at the token
 RELEASE_SECONDS = 30.0  # in which the process of a killed worker has let go of the folder

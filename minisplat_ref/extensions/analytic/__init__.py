@@ -23,8 +23,8 @@ thresholds for the longest and thinnest footprints are replaced by bounds of the
     minisplat-ref oracle gradients --extension analytic
 """
 
+from minisplat_ref.extensions.analytic.gradient_checks import stages
 from minisplat_ref.extensions.analytic.method import ANALYTIC, INTEGRATED
-from minisplat_ref.extensions.analytic.stages import stages
 from minisplat_ref.extensions.extension import Extension
 
 EXTENSION = Extension("analytic", recipes=(ANALYTIC,), representation=INTEGRATED, stages=stages)

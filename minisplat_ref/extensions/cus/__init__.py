@@ -46,8 +46,8 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.extensions.cus import features
+from minisplat_ref.extensions.cus.gradient_checks import stages
 from minisplat_ref.extensions.cus.method import ANCHORS, CUS
-from minisplat_ref.extensions.cus.stages import stages
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply

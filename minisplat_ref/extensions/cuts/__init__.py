@@ -28,8 +28,8 @@ gradient shows. Training does not change which axes are the first two; if a Gaus
 curves are seen edge on.
 """
 
+from minisplat_ref.extensions.cuts.gradient_checks import stages
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS
-from minisplat_ref.extensions.cuts.stages import stages
 from minisplat_ref.extensions.extension import Extension
 
 EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages)

@@ -31,9 +31,9 @@ Left out are textures, view-dependent colour, growing new fans, and pruning by g
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.fans import export, fine_tune
+from minisplat_ref.extensions.fans.gradient_checks import stages
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans
 from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
-from minisplat_ref.extensions.fans.stages import stages
 
 EXTENSION = Extension(
     "fans",

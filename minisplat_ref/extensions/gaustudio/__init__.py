@@ -34,8 +34,8 @@ initialisers and depths that need a network, and the balls of several radii.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.gaustudio import masks, modules
+from minisplat_ref.extensions.gaustudio.gradient_checks import stages
 from minisplat_ref.extensions.gaustudio.method import RECIPE, STUDIO
-from minisplat_ref.extensions.gaustudio.stages import stages
 
 EXTENSION = Extension(
     "gaustudio",

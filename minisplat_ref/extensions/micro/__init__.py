@@ -31,7 +31,7 @@ out is LPIPS in the loss, whose weights are not ours to ship.
 """
 
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.micro.gradient_checks import stages
 from minisplat_ref.extensions.micro.method import MICRO
-from minisplat_ref.extensions.micro.stages import stages
 
 EXTENSION = Extension("micro", recipes=(MICRO,), stages=stages)

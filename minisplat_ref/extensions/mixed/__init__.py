@@ -42,8 +42,8 @@ vertices, as in the paper, and size limits consider deviations alone.
 """
 
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds, stages
 from minisplat_ref.extensions.mixed.method import MIXED, MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.stages import of_all_kinds, stages
 
 EXTENSION = Extension(
     "mixed",

@@ -30,8 +30,8 @@ centres, for which there is ``minisplat-ref mesh``.
 """
 
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.mvg.gradient_checks import stages
 from minisplat_ref.extensions.mvg.method import MVG
-from minisplat_ref.extensions.mvg.stages import stages
 from minisplat_ref.mechanisms.surfels.discs import DISCS
 
 EXTENSION = Extension("mvg", recipes=(MVG,), representation=DISCS, stages=stages)

@@ -35,10 +35,10 @@ same only if the rows are sorted already; here it is the inverse.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.omg import pack
 from minisplat_ref.extensions.omg.file import OMG_FILE
+from minisplat_ref.extensions.omg.gradient_checks import stages
 from minisplat_ref.extensions.omg.method import OMG
 from minisplat_ref.extensions.omg.population import load_plain, save_plain, with_features
 from minisplat_ref.extensions.omg.renderer import COMPACT
-from minisplat_ref.extensions.omg.stages import stages
 
 EXTENSION = Extension(
     "omg",

@@ -29,8 +29,8 @@ footprints.
 """
 
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.pixel_order.gradient_checks import stages
 from minisplat_ref.extensions.pixel_order.method import ORDERED, PIXEL_ORDER
-from minisplat_ref.extensions.pixel_order.stages import stages
 
 EXTENSION = Extension(
     "pixel-order",

@@ -40,8 +40,8 @@ plane, copies are taken in the order of their rows, and others in the order in w
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.polygons import edit, export
+from minisplat_ref.extensions.polygons.gradient_checks import stages
 from minisplat_ref.extensions.polygons.method import POLYGONS, TRACED
-from minisplat_ref.extensions.polygons.stages import stages
 
 EXTENSION = Extension(
     "polygons",

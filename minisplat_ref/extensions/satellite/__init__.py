@@ -33,8 +33,8 @@ corrected (bundle adjustment); image positions have to be right already.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.satellite import surface_model, training
+from minisplat_ref.extensions.satellite.gradient_checks import stages
 from minisplat_ref.extensions.satellite.method import RECIPE, SEEN_FROM_ABOVE
-from minisplat_ref.extensions.satellite.stages import stages
 
 EXTENSION = Extension(
     "satellite",

@@ -33,6 +33,6 @@ weights are not ours to ship.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.style import transfer
-from minisplat_ref.extensions.style.stages import stages
+from minisplat_ref.extensions.style.gradient_checks import stages
 
 EXTENSION = Extension("style", commands=(transfer,), stages=stages)

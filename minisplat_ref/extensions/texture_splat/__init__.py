@@ -27,8 +27,8 @@ Learning rates are ours, and shapes and opacities are trained at those of 3DGS. 
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.texture_splat.file import load
+from minisplat_ref.extensions.texture_splat.gradient_checks import stages
 from minisplat_ref.extensions.texture_splat.method import RECIPE, TEXTURED_SURFELS
-from minisplat_ref.extensions.texture_splat.stages import stages
 
 EXTENSION = Extension(
     "texture-splat",

@@ -30,8 +30,8 @@ trains textures and shapes together from the first iteration on, which the paper
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.textured import fine_tune
+from minisplat_ref.extensions.textured.gradient_checks import stages
 from minisplat_ref.extensions.textured.method import TEXTURED, TEXTURED_GAUSSIANS
-from minisplat_ref.extensions.textured.stages import stages
 
 EXTENSION = Extension(
     "textured",

@@ -31,8 +31,8 @@ from typing import Any
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.vdgs import bake
+from minisplat_ref.extensions.vdgs.gradient_checks import stages
 from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
-from minisplat_ref.extensions.vdgs.stages import stages
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply
 

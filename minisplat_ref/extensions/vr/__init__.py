@@ -26,8 +26,8 @@ out; work is counted in rays, tiles and pairs. The user study cannot be repeated
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.vr import render
+from minisplat_ref.extensions.vr.gradient_checks import stages
 from minisplat_ref.extensions.vr.method import HEADSET, VR, VR_FINE_TUNING
-from minisplat_ref.extensions.vr.stages import stages
 
 EXTENSION = Extension(
     "vr",

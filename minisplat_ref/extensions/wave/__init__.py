@@ -40,7 +40,7 @@ comparison by photographs of a display. There is nothing to train, so the gradie
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.wave import focus, hologram
-from minisplat_ref.extensions.wave.stages import stages
+from minisplat_ref.extensions.wave.gradient_checks import stages
 
 EXTENSION = Extension("wave", commands=(hologram, focus), stages=stages)
 """Two commands, the closed form's gradients."""

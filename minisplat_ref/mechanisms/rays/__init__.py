@@ -6,7 +6,7 @@ A relative brings the shape of its primitives, twice:
 - for the kernels a :class:`~.kernels.RayResponse`, the same for eight rays at a time, and the boxes of its primitives.
 
 :class:`~.renderer.Traced` joins both to its population, and :func:`~.renderer.renderer_of` makes a renderer of it. With
-:func:`~.stages.trace_stages` the gradient check knows which thresholds the rays cross.
+:func:`~.gradient_checks.trace_stages` the gradient check knows which thresholds the rays cross.
 
 In the order of a ray: :mod:`.pixel_rays` (rays of a camera, and what they return), :mod:`.bvh` (the tree),
 :mod:`.traversal` (which primitives a ray meets, in which order), :mod:`.blending` (every ray against every primitive,

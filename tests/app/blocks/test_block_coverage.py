@@ -6,7 +6,7 @@ import pytest
 from minisplat_ref.app.blocks import coverage as coverage_module
 from minisplat_ref.app.blocks.coverage import SHARE_MIN, Coarse, cover, shows
 from minisplat_ref.app.blocks.grid import Block
-from minisplat_ref.app.runs.part import Box, Plane
+from minisplat_ref.app.runs.scene_part import Box, Plane
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.types import FILE_FRAME, Frame, Model, Scene, view_from

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref.app.blocks.grid import divide, ground_plane, widen
-from minisplat_ref.app.runs.part import Box, box_from_json
+from minisplat_ref.app.runs.scene_part import Box, box_from_json
 from minisplat_ref.errors import InputError
 from tolerances import CLOSED_FORM
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minisplat_ref.app.runs.part import Box, Part, Plane, Region, read_part, read_region
+from minisplat_ref.app.runs.scene_part import Box, Part, Plane, Region, read_part, read_region
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import Listing, Photo
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView

@@ -34,8 +34,8 @@ from minisplat_ref.app.comparison.plan import Plan
 from minisplat_ref.app.comparison.table import table_cells
 from minisplat_ref.app.runs import trainings
 from minisplat_ref.app.runs.events import Mechanism
-from minisplat_ref.app.runs.fired import Fired, remarks, rows
 from minisplat_ref.app.runs.progress import read_log
+from minisplat_ref.app.runs.recipe_actions import Fired, remarks, rows
 from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene

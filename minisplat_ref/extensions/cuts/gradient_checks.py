@@ -4,7 +4,7 @@ import numpy as np
 
 from minisplat_ref.extensions.cuts.curve import N_EDGES, N_PIECES, TOPS
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
-from minisplat_ref.mechanisms.payload.stages import renderer_stage
+from minisplat_ref.mechanisms.payload.gradient_checks import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits

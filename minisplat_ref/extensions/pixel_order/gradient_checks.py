@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.extensions.pixel_order.method import ORDERED
+from minisplat_ref.mechanisms.tangent.gradient_checks import renderer_stage
 from minisplat_ref.mechanisms.tangent.renderer import render
-from minisplat_ref.mechanisms.tangent.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import Backend

@@ -5,7 +5,7 @@ import numpy as np
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.reference import LIMB
 from minisplat_ref.extensions.textured.response import shade
-from minisplat_ref.mechanisms.payload.stages import renderer_stage
+from minisplat_ref.mechanisms.payload.gradient_checks import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits

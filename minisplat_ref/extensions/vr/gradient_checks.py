@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
-from minisplat_ref.mechanisms.tangent.stages import renderer_stage
+from minisplat_ref.mechanisms.tangent.gradient_checks import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import Backend

@@ -11,8 +11,8 @@ from minisplat_ref.extensions.texture_splat.method import TEXTURED_SURFELS
 from minisplat_ref.extensions.texture_splat.population import with_textures
 from minisplat_ref.extensions.texture_splat.reference import REACH, TILT_MAX
 from minisplat_ref.extensions.texture_splat.renderer import render
+from minisplat_ref.mechanisms.gbuffer.gradient_checks import shading_stage
 from minisplat_ref.mechanisms.gbuffer.population import WITH_OCCLUSION
-from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.mechanisms.surfels.renderer import Shown
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.oracle.models import Drawn

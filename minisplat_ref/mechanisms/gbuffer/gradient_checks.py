@@ -15,7 +15,7 @@ from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS
 from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficients
 from minisplat_ref.mechanisms.gbuffer.shading import ShadingTape
 from minisplat_ref.mechanisms.gbuffer.tone import KNEE
-from minisplat_ref.mechanisms.surfels import stages as of_surfels
+from minisplat_ref.mechanisms.surfels import gradient_checks as of_surfels
 from minisplat_ref.oracle.models import Drawn, model_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage

@@ -4,7 +4,7 @@ import numpy as np
 
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
 from minisplat_ref.mechanisms.surfels.discs import DISCS
-from minisplat_ref.mechanisms.surfels.stages import rays_stage, renderer_stage
+from minisplat_ref.mechanisms.surfels.gradient_checks import rays_stage, renderer_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage

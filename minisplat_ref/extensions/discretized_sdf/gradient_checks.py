@@ -11,8 +11,8 @@ from minisplat_ref.extensions.discretized_sdf.reference import (
     projected,
     projected_vjp,
 )
+from minisplat_ref.mechanisms.gbuffer.gradient_checks import shading_stage
 from minisplat_ref.mechanisms.gbuffer.population import WITH_OCCLUSION
-from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage

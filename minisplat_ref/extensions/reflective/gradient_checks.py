@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.extensions.reflective.method import SHADED
+from minisplat_ref.mechanisms.gbuffer.gradient_checks import shading_stage
 from minisplat_ref.mechanisms.gbuffer.population import PER_SURFEL, WITH_OCCLUSION
 from minisplat_ref.mechanisms.gbuffer.renderer import render
-from minisplat_ref.mechanisms.gbuffer.stages import shading_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import Backend

@@ -9,7 +9,7 @@ from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
 from minisplat_ref.extensions.mixed.response import INSIDE
 from minisplat_ref.extensions.mixed.surfaces import SurfacePlace
-from minisplat_ref.mechanisms.payload.stages import renderer_stage
+from minisplat_ref.mechanisms.payload.gradient_checks import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
