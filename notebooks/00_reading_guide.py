@@ -149,18 +149,11 @@ layers = [[name.strip(" ()") for name in re.split("[|:]", row)] for row in rows]
 layers = [[name for name in layer if name in exists] for layer in layers]
 layers = [layer for layer in layers if layer and layer != ["__main__"]]
 notes = {
-    "cli": "arguments, progress, files",
+    "app": "commands, runs and their folders, comparison, viewer, reports",
     "bench": "speed beside error",
-    "comparison": "recipes side by side",
-    "viewer": "a scene in the browser",
-    "blocks": "a large scene in parts",
-    "runs": "a training and its folder",
-    "warm_up": "kernels ahead of their use",
     "testing": "the oracle for other tests",
     "extensions": "relatives of 3DGS; no layer below imports them",
     "mechanisms": "what several relatives are made of",
-    "studies": "claims, and the kit that measures them",
-    "reports": "pages, plots, images",
     "oracle": "correctness only",
     "datasets": "scenes to train on",
     "methods": "one per paper: its events and their dates",
@@ -168,27 +161,19 @@ notes = {
     "strategy": "edits of a population",
     "metrics": "metrics",
     "io": "files",
-    "gsplat_compat": "gsplat's call",
-    "gsplat_arguments": "its arguments",
+    "gsplat": "gsplat's call",
     "rendering": "from parameters to an image and back",
-    "splatting": "one view of activated Gaussians",
-    "backends": "one function for every stage",
-    "stages": "what these functions take and return",
     "cuda": "the same loops on a GPU",
     "cpu": "loops over all Gaussians, all pixels",
     "reference": "the formulas as matrices",
     "scalar": "the same for one Gaussian or pixel",
-    "lpips": "the perceptual distance",
     "jit": "compiling, lanes",
     "validation": "checks of input",
     "types": "arrays",
-    "showing": "one line, a picture",
     "constants": "conventions",
     "errors": "bad input",
-    "reporting": "tables",
-    "progress": "bars",
+    "interface": "options, bars, tables",
     "memory": "estimates",
-    "arguments": "options",
 }
 figure, axes = plt.subplots(figsize=(10.5, 0.48 * len(layers) + 0.3))
 for level, layer in enumerate(reversed(layers)):
@@ -346,9 +331,7 @@ assert set(modules) == exists - {"__main__"} and {"reference", "scalar", "cpu", 
 
 # The reference is below everything that uses it, and beside the scalars that it is checked against.
 level = {name: i for i, layer in enumerate(layers) for name in layer}
-assert (
-    level["training"] < level["rendering"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
-)
+assert level["training"] < level["rendering"] < level["cpu"] < level["reference"] == level["scalar"] < level["types"]
 
 # Every module has a note on the map, and every notebook a place in the reading order.
 assert set(modules) == set(notes)

@@ -135,12 +135,13 @@ def _quiet(folder: Path) -> None:
 
 def _estimated(folder: Path) -> None:
     """The time of the first iteration, which compiles, is not in the estimate of the rest."""
-    state = SimpleNamespace(layout=gaussians())
+    n_gaussians = len(gaussians().means)
     view = SimpleNamespace(image=np.zeros((2, 2, 3), np.uint8), mask=None)
     output = SimpleNamespace(image=np.zeros((2, 2, 3)))
 
     def report(step: int) -> Any:
-        return SimpleNamespace(step=step, last_step=100_000, notes=(), loss=0.1, output=output, view=view, state=state)
+        sizes = {"n_gaussians": n_gaussians, "n_bytes": 236 * n_gaussians}
+        return SimpleNamespace(step=step, last_step=100_000, notes=(), loss=0.1, output=output, view=view, **sizes)
 
     with Progress(folder / "log.jsonl", 0, 100_000) as progress:
         time.sleep(1.5)  # compiling
