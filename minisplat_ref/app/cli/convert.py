@@ -1,14 +1,13 @@
 """``convert``: a model from any file into a PLY, a compact format or a page to send."""
 
 import argparse
-import math
 import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, decibels, integer
 
 if TYPE_CHECKING:
     from minisplat_ref.app.runs.conversion import Choice, Source
@@ -53,7 +52,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("output", type=Path, metavar="OUT", help="file to make or replace")
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--max-bytes", type=integer(1), metavar="B", help="size that the file may have")
-    how.add_argument("--max-drop", type=_drop, metavar="dB", help="PSNR that the file may lose")
+    how.add_argument("--max-drop", type=decibels, metavar="dB", help="PSNR that the file may lose")
     how.add_argument("--level", type=integer(0), metavar="N", help="precision (default: the format's own)")
     parser.add_argument("--scene", type=Path, metavar="PATH", help="photographs for --max-drop (default: the run's)")
     parser.add_argument(
@@ -147,13 +146,3 @@ def _choose(args: argparse.Namespace, source: "Source", format_: "Format") -> "t
     if level >= len(format_.levels):
         raise InputError(f"--level {level} is too high: {format_.suffix} has levels 0 to {len(format_.levels) - 1}")
     return conversion.Choice(level, format_.encode(gaussians, level)), []
-
-
-def _drop(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of dB of at least 0")
-    return value
