@@ -45,35 +45,6 @@ class Gaussians(NamedTuple):
         return one_line(self)
 
 
-class Primitives(NamedTuple):
-    """Gaussians after their activations, ready to be rendered."""
-
-    means: Floats
-    """[N, 3] world frame, world units."""
-    quats: Floats
-    """[N, 4] wxyz, any length but zero."""
-    scales: Floats
-    """[N, 3] standard deviations, world units."""
-    opacities: Floats
-    """[N] in [0, 1]."""
-
-
-NOTHING: Mapping[str, Any] = MappingProxyType({})
-"""An empty mapping, the default for fields and arguments that are mappings."""
-
-
-class Model(NamedTuple):
-    """What is trained and rendered: a population of primitives, and parameters that belong to none of them."""
-
-    gaussians: Any
-    """A population: :class:`Gaussians`, or another NamedTuple of arrays [N, ...] whose first field is ``means``."""
-    shared: Mapping[str, Floats] = NOTHING
-    """Arrays without rows, by name: an exposure or a pose for each photograph, the weights of a network."""
-
-    def __repr__(self) -> str:
-        return one_line(self)
-
-
 class Optics(NamedTuple):
     """How a camera that is no pinhole bends directions; :mod:`minisplat_ref.mechanisms.cameras` has the functions."""
 
@@ -114,201 +85,6 @@ class Camera(NamedTuple):
         """Return the same camera with its pose in another precision."""
         R, t = np.asarray(self.cam_from_world_R, dtype), np.asarray(self.cam_from_world_t, dtype)
         return self._replace(cam_from_world_R=R, cam_from_world_t=t)
-
-
-class Projection(NamedTuple):
-    """What one camera sees of each Gaussian: its footprint in the image. Culled Gaussians have zeros everywhere."""
-
-    means2d: Floats
-    """[N, 2] projected centres, pixels."""
-    depths: Floats
-    """[N] camera z of the means, world units."""
-    conics: Floats
-    """[N, 3] inverse projected covariance (a, b, c) of a dx^2 + 2 b dx dy + c dy^2, px^-2.
-
-    The kernels give it in float64 whatever the data: of a needle 500 pixels long and half a pixel wide, a c and b^2
-    agree to six digits, and float32 would leave one of the difference, or none.
-    """
-    opacities: Floats
-    """[N] opacities, multiplied by the antialiasing compensation where the conventions ask for it."""
-    radii: Ints
-    """[N, 2] int32 half-extents along x and y, pixels; 0 where culled."""
-    boxes: Ints
-    """[N, 4] int32 pixels x0, y0, x1, y1 (half-open, in the image) that the Gaussian may touch; empty where culled."""
-
-
-class ProjectionGradient(NamedTuple):
-    """Gradient of the loss with respect to the differentiable fields of a :class:`Projection`."""
-
-    means2d: Floats
-    """[N, 2] per pixel."""
-    depths: Floats
-    """[N]."""
-    conics: Floats
-    """[N, 3]; the entry of b is the derivative with respect to b itself, which occurs twice in the symmetric matrix."""
-    opacities: Floats
-    """[N]."""
-
-
-class PrimitiveGradient(NamedTuple):
-    """Gradient of the loss with respect to the inputs of :func:`project`."""
-
-    means: Floats
-    """[N, 3]."""
-    quats: Floats
-    """[N, 4]."""
-    scales: Floats
-    """[N, 3] with respect to the activated scales."""
-    opacities: Floats
-    """[N] with respect to the activated opacities."""
-    cam_from_world_R: Floats
-    """[3, 3] with respect to the nine entries, unconstrained."""
-    cam_from_world_t: Floats
-    """[3]."""
-
-
-class SHGradient(NamedTuple):
-    """Gradient of the loss with respect to the inputs of :func:`sh_colors`."""
-
-    means: Floats
-    """[N, 3] through the viewing direction."""
-    sh_dc: Floats
-    """[N, 3]."""
-    sh_rest: Floats
-    """[N, K-1, 3]; zero above the active degree."""
-    cam_from_world_R: Floats
-    """[3, 3] through the camera centre -R^T t."""
-    cam_from_world_t: Floats
-    """[3]."""
-
-
-class TileGrid(NamedTuple):
-    """How an image is divided into tiles; the last column and row of tiles may extend beyond the image."""
-
-    width: int
-    """Image width, pixels."""
-    height: int
-    """Image height, pixels."""
-    tile_width: int
-    """Pixels."""
-    tile_height: int
-    """Pixels."""
-
-    @property
-    def n_tiles_x(self) -> int:
-        """Number of tile columns."""
-        return -(-self.width // self.tile_width)
-
-    @property
-    def n_tiles_y(self) -> int:
-        """Number of tile rows."""
-        return -(-self.height // self.tile_height)
-
-
-class TileBins(NamedTuple):
-    """The Gaussians that may touch each tile, front to back; tiles in row-major order."""
-
-    gaussian_ids: Ints
-    """[M] int32, ordered by (tile, depth, index)."""
-    tile_offsets: Ints
-    """[n_tiles + 1] int64; tile t owns gaussian_ids[tile_offsets[t]:tile_offsets[t + 1]]."""
-    slots: Ints
-    """[M] int32 index of each pair when the pairs are grouped by Gaussian instead of by tile."""
-    gaussian_offsets: Ints
-    """[N + 1] int64; Gaussian n owns the slots gaussian_offsets[n]:gaussian_offsets[n + 1]."""
-    grid: TileGrid
-    """The tiling."""
-
-
-class BlendStats(NamedTuple):
-    """Per-Gaussian statistics of compositing one view (Mini-Splatting); w = alpha T is the weight of a hit."""
-
-    blend_weight_sum: Floats
-    """[N] sum of w over the pixels."""
-    blend_weight_max: Floats
-    """[N] largest w over the pixels."""
-    hit_count: Ints
-    """[N] int32 number of pixels with a blended hit."""
-    dominant_count: Ints
-    """[N] int32 number of pixels at which the Gaussian has the largest w (the front-most of equals)."""
-    dominant_ids: Ints
-    """[H, W] int32 Gaussian of the largest w; -1 where nothing was hit."""
-
-
-class RenderOutput(NamedTuple):
-    """One composited view."""
-
-    image: Floats
-    """[H, W, D] blended channels, background included."""
-    alpha: Floats
-    """[H, W] accumulated opacity, 1 - final transmittance."""
-    median_depth: Floats | None
-    """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
-    stats: BlendStats | None
-    """Blend statistics; None if not asked for."""
-    saved: Any = None
-    """What the backend saves for its gradient, which without it is slower but just as correct."""
-    visible_ids: Ints | None = None
-    """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""
-    extras: Mapping[str, Any] = NOTHING
-    """Results requested by name that are not channels, such as ``surface``, a :class:`SurfacePoints`."""
-    n_pairs: int = 0
-    """Pairs (tile, Gaussian) of the view, or what a renderer lists instead; memory grows with them."""
-
-    def __repr__(self) -> str:
-        return one_line(self)
-
-    def _repr_png_(self) -> bytes:
-        """Return the image for a notebook."""
-        return to_png(as_bytes(self.image))
-
-
-class CompositeGradient(NamedTuple):
-    """Gradient of the loss with respect to the inputs of :func:`composite`."""
-
-    means2d: Floats
-    """[N, 2] per pixel."""
-    conics: Floats
-    """[N, 3]; see :class:`ProjectionGradient`."""
-    opacities: Floats
-    """[N]."""
-    colors: Floats
-    """[N, D]."""
-    background: Floats
-    """[D]."""
-
-
-class BlendGradient(NamedTuple):
-    """Gradient of the loss with respect to what is blended, for any kind of primitives."""
-
-    primitives: tuple[Floats, ...]
-    """One array for each field of the primitives that has a derivative in their response."""
-    colors: Floats
-    """[N, S] coefficients of colour."""
-    background: Floats
-    """[D]."""
-
-
-class SurfacePoints(NamedTuple):
-    """Where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
-
-    points: Floats
-    """[H, W, 3] world frame; 0 where there is none."""
-    depths: Floats
-    """[H, W] camera z, world units; 0 where there is none or the point lies behind the camera."""
-
-
-class AdamStep(NamedTuple):
-    """The constants of one step of Adam, the same for a whole array."""
-
-    rate: float
-    """Learning rate, bias corrections included."""
-    beta1: float
-    """Decay of the mean gradient."""
-    beta2: float
-    """Decay of the mean squared gradient."""
-    eps: float
-    """Added to the root, bias corrections included."""
 
 
 class View(NamedTuple):
@@ -400,3 +176,227 @@ class Scene(NamedTuple):
         """Return a sheet of the first photographs for a notebook."""
         images = (view.load().image for view in (*self.train_views, *self.test_views))
         return to_png(to_sheet(image for image in images if image.size))
+
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+"""An empty mapping, the default for fields and arguments that are mappings."""
+
+
+class Model(NamedTuple):
+    """What is trained and rendered: a population of primitives, and parameters that belong to none of them."""
+
+    gaussians: Any
+    """A population: :class:`Gaussians`, or another NamedTuple of arrays [N, ...] whose first field is ``means``."""
+    shared: Mapping[str, Floats] = NOTHING
+    """Arrays without rows, by name: an exposure or a pose for each photograph, the weights of a network."""
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+
+class BlendStats(NamedTuple):
+    """Per-Gaussian statistics of compositing one view (Mini-Splatting); w = alpha T is the weight of a hit."""
+
+    blend_weight_sum: Floats
+    """[N] sum of w over the pixels."""
+    blend_weight_max: Floats
+    """[N] largest w over the pixels."""
+    hit_count: Ints
+    """[N] int32 number of pixels with a blended hit."""
+    dominant_count: Ints
+    """[N] int32 number of pixels at which the Gaussian has the largest w (the front-most of equals)."""
+    dominant_ids: Ints
+    """[H, W] int32 Gaussian of the largest w; -1 where nothing was hit."""
+
+
+class RenderOutput(NamedTuple):
+    """One composited view."""
+
+    image: Floats
+    """[H, W, D] blended channels, background included."""
+    alpha: Floats
+    """[H, W] accumulated opacity, 1 - final transmittance."""
+    median_depth: Floats | None
+    """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
+    stats: BlendStats | None
+    """Blend statistics; None if not asked for."""
+    saved: Any = None
+    """What the backend saves for its gradient, which without it is slower but just as correct."""
+    visible_ids: Ints | None = None
+    """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""
+    extras: Mapping[str, Any] = NOTHING
+    """Results requested by name that are not channels, such as ``surface``, a :class:`SurfacePoints`."""
+    n_pairs: int = 0
+    """Pairs (tile, Gaussian) of the view, or what a renderer lists instead; memory grows with them."""
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def _repr_png_(self) -> bytes:
+        """Return the image for a notebook."""
+        return to_png(as_bytes(self.image))
+
+
+class Primitives(NamedTuple):
+    """Gaussians after their activations, ready to be rendered."""
+
+    means: Floats
+    """[N, 3] world frame, world units."""
+    quats: Floats
+    """[N, 4] wxyz, any length but zero."""
+    scales: Floats
+    """[N, 3] standard deviations, world units."""
+    opacities: Floats
+    """[N] in [0, 1]."""
+
+
+class Projection(NamedTuple):
+    """What one camera sees of each Gaussian: its footprint in the image. Culled Gaussians have zeros everywhere."""
+
+    means2d: Floats
+    """[N, 2] projected centres, pixels."""
+    depths: Floats
+    """[N] camera z of the means, world units."""
+    conics: Floats
+    """[N, 3] inverse projected covariance (a, b, c) of a dx^2 + 2 b dx dy + c dy^2, px^-2.
+
+    The kernels give it in float64 whatever the data: of a needle 500 pixels long and half a pixel wide, a c and b^2
+    agree to six digits, and float32 would leave one of the difference, or none.
+    """
+    opacities: Floats
+    """[N] opacities, multiplied by the antialiasing compensation where the conventions ask for it."""
+    radii: Ints
+    """[N, 2] int32 half-extents along x and y, pixels; 0 where culled."""
+    boxes: Ints
+    """[N, 4] int32 pixels x0, y0, x1, y1 (half-open, in the image) that the Gaussian may touch; empty where culled."""
+
+
+class TileGrid(NamedTuple):
+    """How an image is divided into tiles; the last column and row of tiles may extend beyond the image."""
+
+    width: int
+    """Image width, pixels."""
+    height: int
+    """Image height, pixels."""
+    tile_width: int
+    """Pixels."""
+    tile_height: int
+    """Pixels."""
+
+    @property
+    def n_tiles_x(self) -> int:
+        """Number of tile columns."""
+        return -(-self.width // self.tile_width)
+
+    @property
+    def n_tiles_y(self) -> int:
+        """Number of tile rows."""
+        return -(-self.height // self.tile_height)
+
+
+class TileBins(NamedTuple):
+    """The Gaussians that may touch each tile, front to back; tiles in row-major order."""
+
+    gaussian_ids: Ints
+    """[M] int32, ordered by (tile, depth, index)."""
+    tile_offsets: Ints
+    """[n_tiles + 1] int64; tile t owns gaussian_ids[tile_offsets[t]:tile_offsets[t + 1]]."""
+    slots: Ints
+    """[M] int32 index of each pair when the pairs are grouped by Gaussian instead of by tile."""
+    gaussian_offsets: Ints
+    """[N + 1] int64; Gaussian n owns the slots gaussian_offsets[n]:gaussian_offsets[n + 1]."""
+    grid: TileGrid
+    """The tiling."""
+
+
+class SurfacePoints(NamedTuple):
+    """Where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
+
+    points: Floats
+    """[H, W, 3] world frame; 0 where there is none."""
+    depths: Floats
+    """[H, W] camera z, world units; 0 where there is none or the point lies behind the camera."""
+
+
+class AdamStep(NamedTuple):
+    """The constants of one step of Adam, the same for a whole array."""
+
+    rate: float
+    """Learning rate, bias corrections included."""
+    beta1: float
+    """Decay of the mean gradient."""
+    beta2: float
+    """Decay of the mean squared gradient."""
+    eps: float
+    """Added to the root, bias corrections included."""
+
+
+class PrimitiveGradient(NamedTuple):
+    """Gradient of the loss with respect to the inputs of :func:`project`."""
+
+    means: Floats
+    """[N, 3]."""
+    quats: Floats
+    """[N, 4]."""
+    scales: Floats
+    """[N, 3] with respect to the activated scales."""
+    opacities: Floats
+    """[N] with respect to the activated opacities."""
+    cam_from_world_R: Floats
+    """[3, 3] with respect to the nine entries, unconstrained."""
+    cam_from_world_t: Floats
+    """[3]."""
+
+
+class SHGradient(NamedTuple):
+    """Gradient of the loss with respect to the inputs of :func:`sh_colors`."""
+
+    means: Floats
+    """[N, 3] through the viewing direction."""
+    sh_dc: Floats
+    """[N, 3]."""
+    sh_rest: Floats
+    """[N, K-1, 3]; zero above the active degree."""
+    cam_from_world_R: Floats
+    """[3, 3] through the camera centre -R^T t."""
+    cam_from_world_t: Floats
+    """[3]."""
+
+
+class ProjectionGradient(NamedTuple):
+    """Gradient of the loss with respect to the differentiable fields of a :class:`Projection`."""
+
+    means2d: Floats
+    """[N, 2] per pixel."""
+    depths: Floats
+    """[N]."""
+    conics: Floats
+    """[N, 3]; the entry of b is the derivative with respect to b itself, which occurs twice in the symmetric matrix."""
+    opacities: Floats
+    """[N]."""
+
+
+class CompositeGradient(NamedTuple):
+    """Gradient of the loss with respect to the inputs of :func:`composite`."""
+
+    means2d: Floats
+    """[N, 2] per pixel."""
+    conics: Floats
+    """[N, 3]; see :class:`ProjectionGradient`."""
+    opacities: Floats
+    """[N]."""
+    colors: Floats
+    """[N, D]."""
+    background: Floats
+    """[D]."""
+
+
+class BlendGradient(NamedTuple):
+    """Gradient of the loss with respect to what is blended, for any kind of primitives."""
+
+    primitives: tuple[Floats, ...]
+    """One array for each field of the primitives that has a derivative in their response."""
+    colors: Floats
+    """[N, S] coefficients of colour."""
+    background: Floats
+    """[D]."""

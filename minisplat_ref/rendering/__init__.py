@@ -5,6 +5,7 @@
 :mod:`.backends`   one function per stage: NumPy, compiled kernels, a GPU
 :mod:`.splatting`  one view of activated Gaussians, stage by stage
 :mod:`.renderer`   activations, :func:`render` and :func:`render_vjp`, and what a renderer is
+:mod:`.wrapping`   :func:`wrap`: a renderer that changes what another one renders
 ================== ==========================================================================
 """
 
@@ -24,9 +25,11 @@ from minisplat_ref.rendering.renderer import (
     render,
     render_vjp,
 )
+from minisplat_ref.rendering.wrapping import Inputs, wrap
 
 __all__ = [
     "SPLATTING",
+    "Inputs",
     "RenderGradient",
     "RenderSettings",
     "RenderTape",
@@ -40,4 +43,5 @@ __all__ = [
     "parameters_vjp",
     "render",
     "render_vjp",
+    "wrap",
 ]

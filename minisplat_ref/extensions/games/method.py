@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,33 +12,23 @@ from minisplat_ref.extensions.games.faces import FaceGaussians, on_own_faces, pl
 from minisplat_ref.io.frames import Unit, place_points
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, load_mesh
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.rendering import SPLATTING, Inputs, RenderGradient, Request, wrap
 from minisplat_ref.strategy.initialization import are_seen, from_means
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import During
 from minisplat_ref.training.state import Iteration, TrainState
-from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
+from minisplat_ref.types import Model, Scene, View
 
 
-class FaceTape(NamedTuple):
-    """The values that :func:`render` keeps for :func:`render_vjp`."""
-
-    splatting: Any
-    gaussians: FaceGaussians
+def _place(model: Model, view: View, request: Request) -> tuple[Inputs, FaceGaussians]:
+    """Return the inputs with the Gaussians where their faces place them, and the Gaussians as they are."""
+    return (model._replace(gaussians=place(model.gaussians)), view, request), model.gaussians
 
 
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, FaceTape]:
-    """Render the Gaussians where their faces place them, as 3DGS does."""
-    g = model.gaussians
-    output, tape = SPLATTING.render(model._replace(gaussians=place(g)), view, request)
-    return output, FaceTape(tape, g)
-
-
-def render_vjp(tape: FaceTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`: that of means and scales passes to weights of corners and to sizes."""
-    v = SPLATTING.render_vjp(tape.splatting, v_image, v_alpha)
-    return v._replace(gaussians=place_vjp(tape.gaussians, v.gaussians))
+def _place_vjp(gaussians: FaceGaussians, v: RenderGradient) -> RenderGradient:
+    """Gradient of :func:`_place`: that of means and scales passes to weights of corners and to sizes."""
+    return v._replace(gaussians=place_vjp(gaussians, v.gaussians))
 
 
 def on_faces(mesh: Mesh, scene: Scene, sh_degree: int, rng: np.random.Generator, *, per_face: int) -> FaceGaussians:
@@ -120,7 +109,7 @@ ON_FACES = Representation(
     population=FaceGaussians,
     extend=on_own_faces,
     from_file=partial(from_mesh, per_face=5),
-    renderer=Renderer("games", render, render_vjp, SPLATTING.channels),
+    renderer=wrap(SPLATTING, "games", _place, _place_vjp),
     rates=Rates(RATES, frozenset()),
     units={**WORLD_UNITS, "p0": Unit.PLACE, "p1": Unit.PLACE, "p2": Unit.PLACE},
 )

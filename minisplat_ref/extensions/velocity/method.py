@@ -1,16 +1,16 @@
 """The population with velocities, its renderer, and the recipe that trains it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.rendering import SPLATTING, Inputs, RenderGradient, Request, wrap
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
-from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
+from minisplat_ref.types import Floats, Gaussians, Model, View
 
 
 class MovingGaussians(NamedTuple):
@@ -27,11 +27,6 @@ class MovingGaussians(NamedTuple):
     """[N, 3] world units per unit of time."""
 
 
-class _Tape(NamedTuple):
-    inner: Any  # of the renderer of 3DGS
-    time: float
-
-
 def at_rest(gaussians: Gaussians, rng: np.random.Generator) -> MovingGaussians:
     """Return the Gaussians with velocities of zero."""
     return MovingGaussians(**gaussians._asdict(), velocities=np.zeros_like(gaussians.means))
@@ -43,17 +38,14 @@ def still_at(moving: MovingGaussians, time: float) -> Gaussians:
     return still._replace(means=means_at(moving.means, moving.velocities, time))
 
 
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
-    """Render the scene at the time of the view."""
-    still = still_at(model.gaussians, view.time)
-    output, tape = SPLATTING.render(model._replace(gaussians=still), view, request)
-    return output, _Tape(tape, view.time)
+def _hold_still(model: Model, view: View, request: Request) -> tuple[Inputs, float]:
+    """Return the inputs with the Gaussians at the time of the view, and that time."""
+    return (model._replace(gaussians=still_at(model.gaussians, view.time)), view, request), view.time
 
 
-def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
-    """Gradient of :func:`render`: that of 3DGS, carried on to the velocities."""
-    v = SPLATTING.render_vjp(tape.inner, v_image, v_alpha)
-    v_means, v_velocities = means_at_vjp(tape.time, v.gaussians.means)
+def _hold_still_vjp(time: float, v: RenderGradient) -> RenderGradient:
+    """Gradient of :func:`_hold_still`: that of the means reaches the velocities, too."""
+    v_means, v_velocities = means_at_vjp(time, v.gaussians.means)
     v_still = v.gaussians._replace(means=v_means)
     return v._replace(gaussians=MovingGaussians(**v_still._asdict(), velocities=v_velocities))
 
@@ -63,7 +55,7 @@ MOVING = Representation(
     population=MovingGaussians,
     units={**WORLD_UNITS, "velocities": Unit.LENGTH},
     extend=at_rest,
-    renderer=Renderer("velocity", render, render_vjp, SPLATTING.channels),
+    renderer=wrap(SPLATTING, "velocity", _hold_still, _hold_still_vjp),
     # In one unit of time a Gaussian goes as far as its velocity: the rate of the means, per extent as theirs, and five
     # times as large, since a view at time t passes only a part t of its gradient on.
     rates=Rates({"velocities": LogLinear(8e-4, 8e-6, 30_000)}, frozenset({"velocities"})),
