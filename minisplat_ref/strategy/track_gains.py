@@ -107,20 +107,36 @@ def estimate_gains(scene: Scene) -> TrackGains:
     for k in range(3):
         rest = observed.log_colors[:, k] - gains[observed.view_ids, k]
         log_colors[ids, k] = np.bincount(inverse, rest) / n
-    halves = [_take(observed, observed.point_ids % 2 == parity) for parity in (0, 1)]
-    found = [fit_gains(half, n_views).mean(axis=1)[:, None] for half in halves]  # [V, 1] each
-    means = [half._replace(log_colors=half.log_colors.mean(axis=1)[:, None]) for half in halves]
-    nothing = np.zeros((n_views, 1))
-    return TrackGains(
-        gains,
-        is_known,
-        log_colors,
-        error=float(np.std((found[0] - found[1])[is_known]) / 2) if is_known.any() else 0.0,
-        residual=float(np.mean([_residual(half, nothing) for half in means])),
-        residual_with_gains=float(
-            np.mean([_residual(half, other) for half, other in zip(means, found[::-1], strict=True)])
-        ),
-    )
+    return TrackGains(gains, is_known, log_colors, *cross_validate(observed, n_views))
+
+
+def cross_validate(observed: Observations, n_views: int) -> tuple[float, float, float]:
+    """Return the three figures of :class:`TrackGains` by which gains are judged, from the means of three channels.
+
+    Gains of points with even numbers are applied to those with odd numbers, and vice versa. If gains of half of the
+    points have the standard deviation s sqrt(2), those of all have s, and the difference of two halves has 2 s.
+
+    Parameters
+    ----------
+    observed : Observations
+        Of photographs whose gains are known.
+    n_views : int
+        V.
+
+    Returns
+    -------
+    error, residual, residual_with_gains : float
+        All 0 if no photograph has a known gain.
+    """
+    if len(observed.view_ids) == 0:
+        return 0.0, 0.0, 0.0
+    gray = observed._replace(log_colors=observed.log_colors.mean(axis=1, keepdims=True))
+    halves = [_take(gray, gray.point_ids % 2 == parity) for parity in (0, 1)]
+    even, odd = (fit_gains(half, n_views) for half in halves)  # [V, 1]
+    error = np.std((even - odd)[np.unique(observed.view_ids)]) / 2
+    without = [_residual(half, np.zeros((n_views, 1))) for half in halves]
+    with_gains = [_residual(half, other) for half, other in zip(halves, (odd, even), strict=True)]
+    return float(error), float(np.mean(without)), float(np.mean(with_gains))
 
 
 def observe_points(views: Sequence[View], points: Floats) -> Observations:
@@ -215,16 +231,18 @@ def _observe(index: int, view: View, points: Floats) -> Observations:
 
 
 def _solve(view: Ints, point: Ints, values: Floats, weights: Floats, n_views: int) -> tuple[Floats, Floats]:
-    """Return the g [V] of weighted least squares, of zero mean over what is observed, and the residuals e [M]."""
+    """Return the g [V] of weighted least squares, and the residuals e [M].
+
+    Only differences of g are determined. The solution of least norm has zero mean over photographs that share points,
+    directly or through others, and is 0 where nothing is observed.
+    """
     shape = (int(point.max()) + 1, n_views)
     W = sparse.csr_matrix((weights, (point, view)), shape=shape)  # [Q, V]
     totals = np.bincount(point, weights)  # [Q] W_q
     means = np.bincount(point, weights * values) / totals  # [Q]
     S = np.diag(np.bincount(view, weights, minlength=n_views)) - (W.T @ sparse.diags(1 / totals) @ W).toarray()
     wanted = np.bincount(view, weights * (values - means[point]), minlength=n_views)
-    g = np.linalg.lstsq(S, wanted, rcond=1e-10)[0]  # of least norm: 0 where nothing is observed
-    is_observed = np.bincount(view, minlength=n_views) > 0
-    g[is_observed] -= g[is_observed].mean()
+    g = np.linalg.lstsq(S, wanted, rcond=1e-10)[0]
     rest = values - g[view]
     return g, rest - (np.bincount(point, weights * rest) / totals)[point]
 

@@ -8,6 +8,7 @@ from minisplat_ref.strategy.track_gains import (
     OBSERVATIONS_MIN,
     Observations,
     TrackGains,
+    cross_validate,
     estimate_gains,
     fit_gain_of_view,
     fit_gains,
@@ -60,6 +61,19 @@ def test_photographs_without_common_points_have_no_gain_between_them(rng):
         *(np.concatenate(p) for p in zip(first, (second[0] + 2, second[1] + 9, second[2]), strict=True))
     )
     np.testing.assert_allclose(fit_gains(both, 4)[:, 0], [0.1, -0.1, -0.1, 0.1], atol=1e-12)
+
+
+def test_two_halves_judge_each_other():
+    """Even points are 0.4 brighter in the second photograph, odd ones 0.2: gains of 0.2 and 0.1 to both sides.
+
+    Their difference of 0.1 is two errors. Around the mean of two, a point's colours are off by 0.2 or 0.1 without
+    gains, and by 0.1 with those of the other half; each times sqrt(2), for the mean, and 1.4826, for the median.
+    """
+    view, point = (index.ravel() for index in np.indices((2, 6)))
+    log_colors = np.where(view == 1, np.where(point % 2 == 0, 0.4, 0.2), 0.0)[:, None] * np.ones(3)
+    found = cross_validate(Observations(view, point, log_colors), 2)
+    sigma = 1.4826 * np.sqrt(2)
+    np.testing.assert_allclose(found, [0.05, sigma * 0.15, sigma * 0.1], rtol=1e-9)
 
 
 def test_outliers_do_not_count(rng):
@@ -131,6 +145,17 @@ def test_a_held_out_photograph_has_the_gain_of_its_own_tracks(room, rng):
     np.testing.assert_allclose(gain, 0.25, atol=0.03)
     few = held_out._replace(point_ids=held_out.point_ids[: OBSERVATIONS_MIN - 1])
     assert fit_gain_of_view(few, gains, room.points) is None
+
+
+def test_outliers_of_a_held_out_photograph_do_not_count():
+    """It sees 30 points 3 pixels apart, 20 of them at half of their colour and 10 at full brightness: ln 0.5."""
+    row, column = (3 * index.ravel() + 1 for index in np.indices((3, 10)))
+    points = np.column_stack([(column - 16) / 6, (row - 16) / 6, np.full(30, 5.0)])
+    image = np.full((33, 33, 3), 100, np.uint8)
+    image[:3] = 240
+    view = view_from(CAMERA)._replace(image=image, point_ids=np.arange(30))
+    gains = TrackGains(np.zeros((0, 3)), np.zeros(0, bool), np.log(np.full((30, 3), 200 / 255)), 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(fit_gain_of_view(view, gains, points), np.log([0.5] * 3), rtol=1e-12)
 
 
 def test_without_tracks_no_gain_is_known(room):
