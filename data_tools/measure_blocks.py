@@ -106,7 +106,7 @@ def seam_distance(plan: Plan, coordinates: Floats) -> Floats:
 def _renderer(folder: Path, background: Floats) -> Any:
     trained = load_trained(folder)
     settings = RenderSettings(background, backend=CPU, renderer=trained.renderer)
-    return trained.model.gaussians, lambda view: settings.render(trained.model, view, frozenset({"stats"}))[0]
+    return trained.model.gaussians, lambda view: settings.render_view(trained.model, view, frozenset({"stats"}))[0]
 
 
 def row_of(trained: Trained, seams: tuple[float, float]) -> list[float]:

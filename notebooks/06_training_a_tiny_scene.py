@@ -41,7 +41,8 @@ from minisplat_ref.training.adam import adam_step
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import active_sh_degree
-from minisplat_ref.training.schedule import Every, configure, scale_recipe
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Every, scale_recipe
 
 # %%
 scene = make_scene("room", n_views=24, width=80, height=60, n_points=600, seed=0).scene

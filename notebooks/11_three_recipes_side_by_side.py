@@ -37,7 +37,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import DatedEvent, During, Every, SmallerViews, configure, scale_recipe
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import DatedEvent, During, Every, SmallerViews, scale_recipe
 
 # %%
 ITERATIONS = 900

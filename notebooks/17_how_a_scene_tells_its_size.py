@@ -43,7 +43,7 @@ from minisplat_ref.strategy.ops import concat
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import held_out_ids, trained_ids
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Camera, Gaussians
 
 # %%

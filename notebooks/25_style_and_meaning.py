@@ -47,7 +47,7 @@ view = made.scene.test_views[1]
 
 
 def draw(gaussians):
-    return np.clip(settings.render(Model(gaussians), view_from(view.camera))[0].image, 0, 1)
+    return np.clip(settings.render_view(Model(gaussians), view_from(view.camera))[0].image, 0, 1)
 
 
 masks = [masks_study.object_ids(ids) for ids in made.train_ids]
@@ -206,7 +206,7 @@ _ = figure
 
 # %%
 # The votes of a Gaussian for all labels add up to all the weight that it has in the photographs.
-alphas = [settings.render(Model(room), view_from(camera))[0].alpha.sum() for camera in cameras]
+alphas = [settings.render_view(Model(room), view_from(camera))[0].alpha.sum() for camera in cameras]
 assert np.isclose(votes.weights.sum(), np.sum(alphas), rtol=1e-3)
 assert iou > 0.6
 assert max(curves["clean"]) >= curves["clean"][4] > max(curves["30 % lost"][4], 0.5)

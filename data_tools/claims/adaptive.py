@@ -49,7 +49,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates, n_coefficients, present_degrees
-from minisplat_ref.training.schedule import Recipe, as_trained, configure, does, scale_recipe, settings_of
+from minisplat_ref.training.recipe_settings import configure, match_calibrations, settings_of
+from minisplat_ref.training.schedule import Recipe, does, scale_recipe
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Gaussians, Scene
 
@@ -204,7 +205,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
             return
         now = time.process_time()
         model = report.state.model
-        renderer = as_trained(recipe, model).renderer
+        renderer = match_calibrations(recipe, model).renderer
         value = evaluate(model, scene.test_views, RenderSettings(scene.background, renderer=renderer))
         n = len(report.state.gaussians.means)
         curve.append({"step": report.step, "seconds": now - start - paused, "psnr": value.psnr, "n_gaussians": n})

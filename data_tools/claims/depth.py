@@ -44,7 +44,8 @@ from minisplat_ref.strategy.depth_reinit import (
     reinitial_points,
 )
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configure, firing_steps
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe, firing_steps
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Bools, Floats, Model, Scene
 

@@ -37,7 +37,7 @@ from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.initialization import from_means
 from minisplat_ref.training.losses import Rendered
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Bools, Camera, Floats, Model, Scene, View, number_views, view_from
 
 WIDTH_PX, HEIGHT_PX, N_VIEWS = 96, 72, 8

@@ -25,7 +25,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configure
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Floats, Gaussians, Model, Scene
 
 GAINS = (0.7, 1.4)  # per channel, uniform in the logarithm

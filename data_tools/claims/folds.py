@@ -36,7 +36,8 @@ from minisplat_ref.metrics import ViewMetrics, correct_colors, evaluate, psnr
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.line_of_sight import hidden_share
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, as_trained, configure_by_name
+from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Bools, Floats, Ints, Scene, View, number_views
 
@@ -121,7 +122,7 @@ def measure(fold: Fold, recipe: Recipe, seed: int) -> dict[str, Any]:
     start = time.process_time()
 
     def evaluate_now(state: Any, on_view: Any = None) -> Any:
-        renderer = as_trained(recipe, state.model).renderer
+        renderer = match_calibrations(recipe, state.model).renderer
         return evaluate(
             state.model, scene.test_views, RenderSettings(scene.background, renderer=renderer), on_view=on_view
         )

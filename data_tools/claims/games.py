@@ -91,7 +91,7 @@ def true_points(made: SyntheticScene) -> Floats:
 def depths_of(gaussians: Gaussians, made: SyntheticScene) -> Sequence[Floats]:
     """Return the median depths [H, W] that Gaussians show to the training views."""
     settings, wants = RenderSettings(made.scene.background), frozenset({"median_depth"})
-    outputs = (settings.render(Model(gaussians), view, wants)[0] for view in made.scene.train_views)
+    outputs = (settings.render_view(Model(gaussians), view, wants)[0] for view in made.scene.train_views)
     return [output.median_depth for output in outputs if output.median_depth is not None]
 
 

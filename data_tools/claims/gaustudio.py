@@ -28,7 +28,8 @@ from minisplat_ref.extensions.gaustudio.sky_masks import by_color, from_files
 from minisplat_ref.interface.palette import BLUE, GREY
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.training.schedule import Recipe, configure, parse_settings
+from minisplat_ref.training.recipe_settings import configure, parse_settings
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Bools, Floats, Scene, View
 
 WIDTH, HEIGHT = 256, 192  # of a synthetic scene
@@ -155,7 +156,7 @@ def outcome(subject: Subject, settings: Mapping[str, str], iterations: int, seed
     opacities, scene_opacities, errors, sky_errors, scene_errors = [], [], [], [], []
     for stored in subject.scene.test_views:
         view = stored.load()
-        output, _ = shown.render(state.model, view)
+        output, _ = shown.render_view(state.model, view)
         squares = np.mean((np.clip(output.image[..., :3], 0, 1) - view.image / 255.0) ** 2, axis=2)
         is_sky = subject.is_sky[view.name]
         inside, outside = (binary_erosion(mask, iterations=EDGE, border_value=1) for mask in (is_sky, ~is_sky))

@@ -22,7 +22,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import CPU
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Model
 
 ARMS: dict[str, dict[str, float]] = {
@@ -58,7 +58,7 @@ def outcome(made: SyntheticScene, settings: dict[str, float], name: str, iterati
     render_settings = RenderSettings(made.scene.background, renderer=recipe.renderer)
     errors = []
     for view, truth in zip(made.scene.test_views, made.test_depths, strict=True):
-        output, _ = render_settings.render(Model(state.gaussians), view, frozenset({"depth"}))
+        output, _ = render_settings.render_view(Model(state.gaussians), view, frozenset({"depth"}))
         depth = expected_depth(output.image[..., 3], output.alpha)
         is_counted = (truth > 0) & (output.alpha > ALPHA_MIN)
         errors.append(np.abs(depth - truth)[is_counted] / truth[is_counted])

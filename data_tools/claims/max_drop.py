@@ -39,7 +39,7 @@ from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RE
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.schedule import as_trained
+from minisplat_ref.training.recipe_settings import match_calibrations
 from minisplat_ref.types import Scene, number_views
 
 COLORS = (BLUE, GREEN, OCHRE, RED, PURPLE)
@@ -79,7 +79,7 @@ def train_run(scene: Scene, args: argparse.Namespace, seed: int) -> Run:
         iterations=recipe.iterations,
         seed=seed,
     )
-    return Run(Path(args.scene), settings, as_trained(recipe, model), CORE, scene, model, None, None)
+    return Run(Path(args.scene), settings, match_calibrations(recipe, model), CORE, scene, model, None, None)
 
 
 def measure_limits(run: Run, limits: Sequence[float], fine_tune: int) -> list[dict[str, Any]]:

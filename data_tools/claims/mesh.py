@@ -29,7 +29,8 @@ from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.viewpoints import scene_viewpoints
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import points_at
-from minisplat_ref.training.schedule import Recipe, as_trained, configure_by_name
+from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import FILE_FRAME
 
 TAU = 0.05  # world units, metres of these scenes
@@ -86,7 +87,7 @@ def true_surface(made: SyntheticScene) -> OrientedPoints:
 def train_run(made: SyntheticScene, recipe: Recipe, seed: int) -> Opened:
     """Train, and return what ``mesh`` reads of the folder of a run."""
     state = kit.train_with_progress(made.scene, recipe, seed)
-    renderer = as_trained(recipe, state.model).renderer
+    renderer = match_calibrations(recipe, state.model).renderer
     trained = Trained(state.model, renderer, made.scene.background, GSPLAT_MAIN.name, "cpu")
     views = [view for view in scene_viewpoints(made.scene) if view.split != "test"]
     return Opened(trained, views, FILE_FRAME)

@@ -23,7 +23,7 @@ from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.rendering.backends import CPU
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Floats, Model, Scene, view_from
 
 BLOCKS = (1, 2, 4, 8, 16)

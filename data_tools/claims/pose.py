@@ -27,7 +27,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configure
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Camera, Floats, Gaussians, Scene, View
 
 

@@ -40,7 +40,8 @@ from minisplat_ref.rendering.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, as_trained
+from minisplat_ref.training.recipe_settings import match_calibrations
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Model, Scene
 
@@ -156,7 +157,9 @@ def measure(scene: Scene, recipe: Recipe, precision: str, seed: int) -> list[dic
 
     def record(name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:
         quality = evaluate(
-            model, scene.test_views, RenderSettings(scene.background, renderer=as_trained(recipe, model).renderer)
+            model,
+            scene.test_views,
+            RenderSettings(scene.background, renderer=match_calibrations(recipe, model).renderer),
         )
         return {
             "precision": name,

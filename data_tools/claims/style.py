@@ -113,7 +113,7 @@ def outcome(made: SyntheticScene, gaussians: Gaussians, image: Floats) -> dict[s
 
 
 def _render(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Floats:
-    return np.clip(settings.render(Model(gaussians), view_from(camera))[0].image, 0, 1)
+    return np.clip(settings.render_view(Model(gaussians), view_from(camera))[0].image, 0, 1)
 
 
 def feature_distance(image: Floats, style: Floats) -> float:

@@ -22,7 +22,7 @@ from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 
 GAUSSIANS = "3dgs-accel"
 ARMS: dict[str, dict[str, float]] = {
@@ -64,7 +64,7 @@ def outcome(made: SyntheticScene, arm: str, iterations: int, seed: int) -> dict[
     settings = RenderSettings(made.scene.background, renderer=recipe.renderer)
     depth_errors, angles = [], []
     for view, truth, normals in zip(made.scene.test_views, made.test_depths, made.test_normals, strict=True):
-        output, _ = settings.render(state.model, view, frozenset({"depth"}))
+        output, _ = settings.render_view(state.model, view, frozenset({"depth"}))
         depth = expected_depth(output.image[..., 3], output.alpha)
         is_counted = (truth > 0) & (output.alpha > ALPHA_MIN)
         depth_errors.append((np.abs(depth - truth) / np.where(truth > 0, truth, 1))[is_counted])

@@ -34,8 +34,8 @@ from minisplat_ref.oracle.golden import files as golden
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Frame, Gaussians
 
 FRAME = Frame((450_000.0, 5_410_000.0, 260.0), 0.5)

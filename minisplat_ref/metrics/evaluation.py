@@ -164,7 +164,7 @@ def evaluate(
         check_views(network, views)
     per_view = []
     for view in (view.load() for view in views):
-        image = np.clip(settings.render(model, view)[0].image, 0.0, 1.0)  # [H, W, 3]
+        image = np.clip(settings.render_view(model, view)[0].image, 0.0, 1.0)  # [H, W, 3]
         metrics = ViewMetrics(
             view.name,
             psnr(image, view.image, view.mask),

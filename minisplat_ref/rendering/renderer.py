@@ -363,7 +363,7 @@ class RenderSettings(NamedTuple):
         """Return the request for a view; see :class:`Request`."""
         return Request(self.background, sh_degree, self.conventions, self.backend, wants=wants)
 
-    def render(
+    def render_view(
         self, model: Any, view: View, wants: frozenset[str] = frozenset(), *, sh_degree: int | None = None
     ) -> tuple[RenderOutput, Any]:
         """Render a view of a :class:`Model` or population; return it with the tape for the gradient."""

@@ -66,7 +66,7 @@ def midpoint_points(model: Any, view: View, settings: RenderSettings) -> PixelPo
     PixelPoints
         In the dtype of the Gaussians.
     """
-    output, _ = settings.render(model, view, frozenset({"surface"}), sh_degree=0)
+    output, _ = settings.render_view(model, view, frozenset({"surface"}), sh_degree=0)
     points, depths = output.extras["surface"]
     return PixelPoints(points, depths, output.alpha)
 
@@ -86,7 +86,7 @@ def centre_points(model: Any, view: View, settings: RenderSettings) -> PixelPoin
     PixelPoints
         In the dtype of the Gaussians.
     """
-    output, _ = settings.render(model, view, frozenset({"dominant_depth"}), sh_degree=0)
+    output, _ = settings.render_view(model, view, frozenset({"dominant_depth"}), sh_degree=0)
     return _on_rays(output.extras["dominant_depth"], output.alpha, view.camera, settings.conventions)
 
 
@@ -106,7 +106,7 @@ def blend_points(model: Any, view: View, settings: RenderSettings) -> PixelPoint
         In the dtype of the Gaussians.
     """
     wants = frozenset({"depth"})
-    output, _ = settings.render(model, view, wants, sh_degree=0)
+    output, _ = settings.render_view(model, view, wants, sh_degree=0)
     sums = output.image[..., settings.renderer.channels(wants)["depth"]][..., 0]  # [H, W]
     depths = expected_depth(sums, output.alpha)  # [H, W]
     return _on_rays(depths, output.alpha, view.camera, settings.conventions)

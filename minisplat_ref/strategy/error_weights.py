@@ -36,7 +36,7 @@ def collect_error_weights(model: Any, views: Sequence[View], settings: RenderSet
     weights = np.zeros(n_rows(model.gaussians))
     for view in views:
         photographed = view.load()
-        output, tape = settings.render(model, photographed)
+        output, tape = settings.render_view(model, photographed)
         errors = np.abs(output.image - photographed.image / output.image.dtype.type(255)).mean(axis=2)  # [H, W]
         if photographed.mask is not None:
             errors[~photographed.mask] = 0

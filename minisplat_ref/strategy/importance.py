@@ -69,7 +69,7 @@ def collect_importance(
         is_visible=np.zeros((n, len(views)), bool),
     )
     for v, seen_from in enumerate(views):
-        output, _ = settings.render(model, seen_from, frozenset({"stats"}), sh_degree=0)
+        output, _ = settings.render_view(model, seen_from, frozenset({"stats"}), sh_degree=0)
         view = output.stats
         assert view is not None
         total.blend_weight_sum[:] += view.blend_weight_sum

@@ -60,7 +60,7 @@ def collect_removal_costs(model: Any, views: Sequence[View], settings: RenderSet
     rgb = renderer.channels(wants)["rgb"]
     for view in views:
         photographed = view.load()
-        output, _ = settings.render(model, photographed, wants)
+        output, _ = settings.render_view(model, photographed, wants)
         if CHANGES not in output.extras:
             raise InputError(f"renderer {renderer.name} does not say what the removal of a Gaussian changes")
         changes += output.extras[CHANGES]

@@ -1,17 +1,17 @@
-"""What a training may add to the Gaussians: exposures, poses, a sky, compensated opacities.
+"""Parameters that may be trained besides the Gaussians: exposures, poses, a sky, compensated opacities.
 
-Each is a set of shared parameters of the model, and a renderer that applies them around another renderer. Each is off
-unless a recipe switches it on, or the user with ``--set NAME=true``:
+Each is a set of shared parameters of the model, and a renderer that wraps another one and applies them. Each is off
+unless a recipe switches it on, or the user does with ``--set NAME=true``:
 
 ================  =======================================================================================
-``exposure``      colours of each photograph, here
-``pose``          place and direction of each camera, here
-``sky``           what lies behind everything: :mod:`minisplat_ref.training.sky`
+``exposure``      colours of each photograph
+``pose``          place and direction of each camera
+``sky``           light from behind the scene: :mod:`minisplat_ref.training.sky`
 ``antialiasing``  opacities for photographs of several sizes: :mod:`minisplat_ref.training.compensation`
 ================  =======================================================================================
 
-The first two have a row for each training view. A view that is not trained on (``view_id`` -1) has none, and is drawn
-as if nothing were calibrated. The others belong to the scene, and are drawn in every view.
+The first two have a row for each training view. A view that is not trained on (``view_id`` -1) has none, and is
+rendered as if nothing were calibrated. The others belong to the scene and affect every view.
 
 *Exposure*, from the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
 as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies from the other side, so it
@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minisplat_ref.rendering import Renderer, RenderGradient, Request
+from minisplat_ref.rendering import Inputs, Renderer, RenderGradient, Request, wrap
 from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.sky import SKY, clear_sky, with_sky
@@ -40,10 +40,10 @@ ANGLE_MIN = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, which
 
 
 class Calibration(NamedTuple):
-    """Shared parameters, and how they enter a rendering."""
+    """Shared parameters, and the renderer that applies them."""
 
     name: str
-    """``--set NAME=true`` switches it on."""
+    """``--set NAME=true`` switches the calibration on."""
     initial: Callable[[int], dict[str, Floats]]
     """``initial(n_views)`` returns the initial shared parameters by name."""
     wrap: Callable[[Renderer], Renderer]
@@ -120,7 +120,7 @@ class _ExposureTape(NamedTuple):
 def with_exposures(inner: Renderer) -> Renderer:
     """Return a renderer that applies each training view's exposure to its colours; other channels stay."""
 
-    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _ExposureTape]:
+    def render_exposed(model: Model, view: View, request: Request) -> tuple[RenderOutput, _ExposureTape]:
         output, tape = inner.render(model, view, request)
         rgb = inner.channels(request.wants)["rgb"]
         colors = output.image[..., rgb]
@@ -130,7 +130,7 @@ def with_exposures(inner: Renderer) -> Renderer:
             output = output._replace(image=image)
         return output, _ExposureTape(tape, model, view, colors, rgb)
 
-    def render_vjp(tape: _ExposureTape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+    def render_exposed_vjp(tape: _ExposureTape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
         if not _has_row(tape.model, tape.view, EXPOSURES):
             return inner.render_vjp(tape.inner, v_image, v_alpha)
         exposures, index = tape.model.shared[EXPOSURES], tape.view.view_id
@@ -139,7 +139,7 @@ def with_exposures(inner: Renderer) -> Renderer:
         v = inner.render_vjp(tape.inner, v_inner, v_alpha)
         return v._replace(shared={**v.shared, EXPOSURES: v_exposures})
 
-    return Renderer(f"{inner.name} with exposures", render, render_vjp, inner.channels)
+    return Renderer(f"{inner.name} with exposures", render_exposed, render_exposed_vjp, inner.channels)
 
 
 # --- pose ---
@@ -223,40 +223,34 @@ def left_jacobian(w: Floats) -> Floats:
     return np.eye(3) + first * W + second * W @ W
 
 
-class _PoseTape(NamedTuple):
-    inner: Any  # tape of the wrapped renderer
-    model: Model
-    view: View  # with its given pose
-
-
 def with_poses(inner: Renderer) -> Renderer:
-    """Return a renderer that draws each training view from its corrected pose."""
+    """Return a renderer that renders each training view from its corrected pose."""
+    return wrap(inner, f"{inner.name} with poses", _correct_view, _correct_view_vjp)
 
-    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _PoseTape]:
-        corrected = view
-        if _has_row(model, view, ROTATIONS):
-            camera, w, u = view.camera, model.shared[ROTATIONS][view.view_id], model.shared[SHIFTS][view.view_id]
-            R, t = correct_pose(camera.cam_from_world_R, camera.cam_from_world_t, w, u)
-            corrected = view._replace(camera=camera._replace(cam_from_world_R=R, cam_from_world_t=t))
-        output, tape = inner.render(model, corrected, request)
-        return output, _PoseTape(tape, model, view)
 
-    def render_vjp(tape: _PoseTape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
-        v = inner.render_vjp(tape.inner, v_image, v_alpha)
-        if not _has_row(tape.model, tape.view, ROTATIONS):
-            return v
-        camera, index = tape.view.camera, tape.view.view_id
-        v_rotations, v_shifts = (np.zeros_like(tape.model.shared[name]) for name in (ROTATIONS, SHIFTS))
-        v_rotations[index], v_shifts[index] = correct_pose_vjp(
-            camera.cam_from_world_R,
-            camera.cam_from_world_t,
-            tape.model.shared[ROTATIONS][index],
-            v.cam_from_world_R,
-            v.cam_from_world_t,
-        )
-        return v._replace(shared={**v.shared, ROTATIONS: v_rotations, SHIFTS: v_shifts})
+def _correct_view(model: Model, view: View, request: Request) -> tuple[Inputs, tuple[Model, View]]:
+    """Return the view with its corrected pose; record the given one."""
+    corrected = view
+    if _has_row(model, view, ROTATIONS):
+        camera, w, u = view.camera, model.shared[ROTATIONS][view.view_id], model.shared[SHIFTS][view.view_id]
+        R, t = correct_pose(camera.cam_from_world_R, camera.cam_from_world_t, w, u)
+        corrected = view._replace(camera=camera._replace(cam_from_world_R=R, cam_from_world_t=t))
+    return (model, corrected, request), (model, view)
 
-    return Renderer(f"{inner.name} with poses", render, render_vjp, inner.channels)
+
+def _correct_view_vjp(record: tuple[Model, View], v: RenderGradient) -> RenderGradient:
+    model, view = record
+    if not _has_row(model, view, ROTATIONS):
+        return v
+    v_rotations, v_shifts = (np.zeros_like(model.shared[name]) for name in (ROTATIONS, SHIFTS))
+    v_rotations[view.view_id], v_shifts[view.view_id] = correct_pose_vjp(
+        view.camera.cam_from_world_R,
+        view.camera.cam_from_world_t,
+        model.shared[ROTATIONS][view.view_id],
+        v.cam_from_world_R,
+        v.cam_from_world_t,
+    )
+    return v._replace(shared={**v.shared, ROTATIONS: v_rotations, SHIFTS: v_shifts})
 
 
 def _has_row(model: Model, view: View, name: str) -> bool:

@@ -13,7 +13,8 @@ from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.dense_start import densify_points
-from minisplat_ref.training.schedule import Recipe, settings_of
+from minisplat_ref.training.recipe_settings import settings_of
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import FILE_FRAME, Scene
 

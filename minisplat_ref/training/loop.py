@@ -19,7 +19,8 @@ from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.iteration import Training
 from minisplat_ref.training.on_device import on_device
 from minisplat_ref.training.pace import COOLED, Decision
-from minisplat_ref.training.schedule import Recipe, as_decided
+from minisplat_ref.training.recipe_settings import apply_decisions
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.smaller_views import ViewSizes
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Scene, number_views
@@ -72,14 +73,14 @@ def train(
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=number_views(scene.train_views))
-    check_fits(state, scene, as_decided(recipe, state.pace))
+    check_fits(state, scene, apply_decisions(recipe, state.pace))
     sizes, switched_on = ViewSizes(recipe, scene), None
     chosen: Any = nullcontext(iteration) if backend.residence is None else on_device(backend, state)
     with ReadingAhead() as ahead, Interruptions() as interruptions, chosen as engine:
         while state.step < last_step(state, recipe):
             _cool_in_time(state, recipe)
             if state.pace.switched_on != switched_on:
-                switched_on, decided = state.pace.switched_on, as_decided(recipe, state.pace)
+                switched_on, decided = state.pace.switched_on, apply_decisions(recipe, state.pace)
                 settings = RenderSettings(scene.background, conventions, backend, decided.renderer)
             n_halvings = sizes.count_halvings(state.step + 1, state.pace)
             halved = sizes.halve(n_halvings)

@@ -20,7 +20,8 @@ from minisplat_ref.training.adam import AdamState, fields_of
 from minisplat_ref.training.calibration import CALIBRATIONS
 from minisplat_ref.training.pace import Pace, from_metadata, to_metadata
 from minisplat_ref.training.rates import n_coefficients
-from minisplat_ref.training.schedule import Recipe, as_decided, describe
+from minisplat_ref.training.recipe_settings import apply_decisions
+from minisplat_ref.training.schedule import Recipe, describe
 from minisplat_ref.training.state import DEGREES, TrainState
 from minisplat_ref.types import FILE_FRAME, Floats, Frame, Gaussians
 
@@ -111,7 +112,7 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
         )
     pace = Pace() if recipe.cooling is None else read_pace(path, metadata.get("pace"))
     bundles = read_bundles(path, arrays, recipe.representation.population)
-    without_rate = [name for name in bundles.shared if name not in as_decided(recipe, pace).rates.of]
+    without_rate = [name for name in bundles.shared if name not in apply_decisions(recipe, pace).rates.of]
     if without_rate:
         raise InputError(f"{path}: holds {', '.join(without_rate)}, which recipe {recipe.name} does not train")
     return TrainState(

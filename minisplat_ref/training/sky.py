@@ -1,14 +1,15 @@
-"""A sky: what lies behind the scene, infinitely far away, as a colour for each direction.
+"""A sky: light from behind the scene, infinitely far away, with a colour for each direction.
 
-Gaussians have a place, and a sky has none: they make it of large veils in front of the cameras, which other views see
-from elsewhere. A pixel whose ray has the unit direction d, in the world frame, and the transmittance T shows
+Gaussians have positions, and a sky has none: without this, training imitates it by large veils in front of the cameras,
+which other views see from the side. A pixel whose ray has the unit direction d, in the world frame, and the
+transmittance T shows
 
     c' = c + T s(d),   s(d) = sum_k s_k Y_k(d)        c: the scene with its background
 
 with the real spherical harmonics Y_k up to degree 3, like the colours of a Gaussian, but neither offset nor clamped.
-The coefficients s_k are a shared parameter of the model, ``sky`` [16, 3], which starts at zero. Pixels that let less
-than a quarter of a step of an 8-bit image through are left as they are: their sky would not be seen, and most pixels
-are such. The renderer wraps any other one. A PLY file has no place for a sky: other viewers show what is before it.
+The coefficients s_k are a shared parameter of the model, ``sky`` [16, 3], which starts at zero. Pixels whose
+transmittance is below a quarter of a step of an 8-bit image, which are most pixels, are left as they are: their sky
+would not be seen. The renderer wraps any other one. A PLY file cannot store a sky: other viewers show the scene alone.
 """
 
 from typing import Any, NamedTuple
@@ -70,7 +71,7 @@ def sky_colors_vjp(rays: Floats, R: Floats, sky: Floats, v_colors: Floats) -> tu
     Parameters
     ----------
     rays, R, sky
-        As for the forward function.
+        As for :func:`sky_colors`.
     v_colors : ndarray of shape (P, 3)
         Derivative with respect to the colours.
 
@@ -111,9 +112,9 @@ class _Tape(NamedTuple):
 
 
 def with_sky(inner: Renderer) -> Renderer:
-    """Return a renderer that draws the sky behind everything, if the model has one; other channels stay."""
+    """Return a renderer that renders the sky behind everything, if the model has one; other channels stay."""
 
-    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+    def render_over_sky(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
         if SKY not in model.shared:
             return inner.render(model, view, request)
         camera = with_principal_point(view.camera, request.conventions)
@@ -131,7 +132,7 @@ def with_sky(inner: Renderer) -> Renderer:
         own = _Tape(tape, sky, model.shared[SKY].dtype, R, pixels, rays, transmittances, colors, rgb)
         return output._replace(image=image), own
 
-    def render_vjp(tape: Any, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+    def render_over_sky_vjp(tape: Any, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
         if not isinstance(tape, _Tape):
             return inner.render_vjp(tape, v_image, v_alpha)
         v_pixels = v_image.reshape(-1, v_image.shape[2])[tape.pixels, tape.rgb]  # [P, 3]
@@ -142,4 +143,4 @@ def with_sky(inner: Renderer) -> Renderer:
         shared = {**v.shared, SKY: v_sky.astype(tape.dtype, copy=False)}
         return v._replace(shared=shared, cam_from_world_R=v.cam_from_world_R + v_R.astype(v_image.dtype))
 
-    return Renderer(f"{inner.name} with sky", render, render_vjp, inner.channels)
+    return Renderer(f"{inner.name} with sky", render_over_sky, render_over_sky_vjp, inner.channels)

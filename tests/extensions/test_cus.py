@@ -52,8 +52,8 @@ from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import LossTerm, Rendered
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.representation import GAUSSIANS
-from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians, Model, RenderOutput, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians

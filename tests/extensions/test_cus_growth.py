@@ -28,7 +28,8 @@ from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.clone_split import screen_gradient_norms
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.schedule import configure, does, firing_steps
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import does, firing_steps
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Model, RenderOutput, view_from
 from scenes import make_camera, make_gaussians

@@ -26,7 +26,8 @@ from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
-from minisplat_ref.training.schedule import configure, firing_steps, settings_of
+from minisplat_ref.training.recipe_settings import configure, settings_of
+from minisplat_ref.training.schedule import firing_steps
 from minisplat_ref.types import Gaussians, Model, RenderOutput, View, view_from
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM

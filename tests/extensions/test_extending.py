@@ -18,7 +18,7 @@ from minisplat_ref.app.cli import _parser_of, main
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.training.losses import Rendered
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Model
 from photo_scenes import write_transforms
 from scenes import as_dtype, make_gaussians

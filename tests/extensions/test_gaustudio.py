@@ -30,7 +30,8 @@ from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy.removal import CHANGES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered, photometric
-from minisplat_ref.training.schedule import alternatives_of, configure, scale_recipe, settings_of
+from minisplat_ref.training.recipe_settings import configure, find_alternatives, settings_of
+from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.training.sky import SKY
 from minisplat_ref.types import Camera, Model, RenderOutput, Scene, View, view_from
 from scenes import make_camera, make_gaussians
@@ -476,7 +477,7 @@ class Trained:
 def test_one_stage_is_exchanged_and_the_others_stay(scene, stage, name):
     """What is checked of the other stages is what holds for the recipe as it is; the exchanged one fails its check."""
     recipe = scale_recipe(find_recipe("gaustudio"), 12)
-    swapped = configure(recipe, **{stage: alternatives_of(bound(recipe, stage))[name]})
+    swapped = configure(recipe, **{stage: find_alternatives(bound(recipe, stage))[name]})
     trained = Trained(scene, swapped)
     for other, check in CHECKS.items():
         if other == stage:

@@ -41,7 +41,8 @@ from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered
-from minisplat_ref.training.schedule import At, During, Every, configure, does
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import At, During, Every, does
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians

@@ -29,7 +29,8 @@ from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import action_name, configure, scale_recipe, without
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import action_name, scale_recipe, without
 from minisplat_ref.training.state import Iteration, apply_edit
 from minisplat_ref.types import FILE_FRAME, Gaussians, Model, Scene, View
 from scenes import as_dtype, make_camera, make_gaussians
@@ -277,13 +278,13 @@ def test_in_the_end_the_fields_are_what_is_drawn(scene):
     start_networks(state, iteration)
     start_codes(state, iteration, **LIMITS, rows_per_code=8)
     settings, view = RenderSettings(scene.background, renderer=COMPACT.renderer), scene.test_views[0]
-    image = settings.render(state.model, view)[0].image
+    image = settings.render_view(state.model, view)[0].image
     plain = Gaussians(*state.gaussians[:6])
-    assert RenderSettings(scene.background).render(plain, view)[0].image.tobytes() != image.tobytes()
+    assert RenderSettings(scene.background).render_view(plain, view)[0].image.tobytes() != image.tobytes()
     write_fields(state, iteration)
     plain = Gaussians(*state.gaussians[:6])
-    assert RenderSettings(scene.background).render(plain, view)[0].image.tobytes() == image.tobytes()
-    assert settings.render(state.model, view)[0].image.tobytes() == image.tobytes()
+    assert RenderSettings(scene.background).render_view(plain, view)[0].image.tobytes() == image.tobytes()
+    assert settings.render_view(state.model, view)[0].image.tobytes() == image.tobytes()
 
 
 def test_a_file_keeps_each_row_together(scene):

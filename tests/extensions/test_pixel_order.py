@@ -30,7 +30,8 @@ from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.rendering import SPLATTING, Request, activate
 from minisplat_ref.rendering.backends import CPU, REFERENCE
-from minisplat_ref.training.schedule import configure, describe, settings_of
+from minisplat_ref.training.recipe_settings import configure, settings_of
+from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 from scenes import as_dtype, balls, in_front_of, make_camera, make_gaussians, turned_camera
 from tolerances import (

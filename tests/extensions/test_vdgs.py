@@ -41,7 +41,7 @@ from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Gaussians, Model, Scene, view_from
 from scenes import as_dtype, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, PARITY_FLOAT64

@@ -24,8 +24,8 @@ from minisplat_ref.io.ply import read_vertices, save_ply
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Gaussians
 from photo_scenes import edit_transforms, write_colmap, write_transforms
 

@@ -17,8 +17,9 @@ from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
+from minisplat_ref.training.recipe_settings import configure, settings_of
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import At, Every, SmallerViews, configure, firing_steps, scale_recipe, settings_of
+from minisplat_ref.training.schedule import At, Every, SmallerViews, firing_steps, scale_recipe
 from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import Iteration, n_pixels
 from minisplat_ref.types import Scene, View

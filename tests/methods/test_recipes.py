@@ -12,16 +12,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.schedule import (
-    At,
-    DatedEvent,
-    During,
-    Every,
-    action_name,
-    configure,
-    describe,
-    scale_recipe,
-)
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import At, DatedEvent, During, Every, action_name, describe, scale_recipe
 
 
 def nothing(state, iteration, **settings):

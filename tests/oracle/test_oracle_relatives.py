@@ -26,8 +26,8 @@ from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.training.calibration import EXPOSURES, expose_vjp
 from minisplat_ref.training.losses import Cotangents, LossTerm
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.representation import GAUSSIANS
-from minisplat_ref.training.schedule import configure
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "EXTENDING.md").read_text(encoding="utf-8")
 

@@ -60,7 +60,7 @@ def test_a_ray_has_the_alpha_of_its_pixel():
     view = view_from(CAMERA)._replace(point_ids=np.arange(20))
     settings = RenderSettings()
     lines = trace_sight_lines(model, view, points, settings, 0.1)
-    alpha = settings.render(model, view)[0].alpha
+    alpha = settings.render_view(model, view)[0].alpha
     columns, rows = (30 * points[:, :2] / 3 + 16.5).astype(int).T
     sums = np.bincount(lines.rays, lines.weights, minlength=20)
     np.testing.assert_allclose(sums, alpha[rows, columns], atol=2e-4)  # the renderer ends a ray at T = 1e-4

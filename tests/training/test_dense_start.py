@@ -17,7 +17,7 @@ from minisplat_ref.training.dense_start import (
     lie_before,
 )
 from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import view_from
 from scenes import make_camera
 

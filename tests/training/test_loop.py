@@ -22,8 +22,9 @@ from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import LogLinear
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import BLEND_STATS, At, During, SmallerViews, configure
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, SmallerViews
 from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import FiredEvent
 from minisplat_ref.types import Gaussians

@@ -30,9 +30,10 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered, photometric, total_loss
 from minisplat_ref.training.rates import LogLinear, Rates, Rewind
+from minisplat_ref.training.recipe_settings import configure, parse_settings, settings_of
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import Every, configure, describe, parse_settings, scale_recipe, settings_of
+from minisplat_ref.training.schedule import Every, describe, scale_recipe
 from minisplat_ref.training.state import Iteration, TrainState, start_again
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 from scenes import make_camera, make_gaussians

@@ -14,7 +14,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.calibration import with_exposures
-from minisplat_ref.training.schedule import as_trained
+from minisplat_ref.training.recipe_settings import match_calibrations
 from minisplat_ref.training.sky import SKY, TRANSMITTANCE_MIN, clear_sky, with_sky
 from minisplat_ref.types import Model, view_from
 from scenes import as_dtype, make_camera, make_gaussians
@@ -86,7 +86,7 @@ def test_a_direction_has_its_colour_wherever_the_camera_stands(view, model):
 
 
 def test_exposure_changes_the_sky_too(view, model):
-    recipe = as_trained(get_recipe("3dgs"), Model(None, {SKY: 0, "exposures": 0}))
+    recipe = match_calibrations(get_recipe("3dgs"), Model(None, {SKY: 0, "exposures": 0}))
     assert [calibration.name for calibration in recipe.active_calibrations] == ["sky", "exposure"]
     twice = np.tile(2.0 * np.eye(3, 4), (1, 1, 1))
     exposed = model._replace(shared={**model.shared, "exposures": twice})

@@ -14,6 +14,7 @@ from minisplat_ref.rendering import Request
 from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.training.adam import AdamState
+from minisplat_ref.training.recipe_settings import configure, settings_of
 from minisplat_ref.training.schedule import (
     At,
     DatedEvent,
@@ -21,11 +22,9 @@ from minisplat_ref.training.schedule import (
     Event,
     Every,
     Recipe,
-    configure,
     does,
     firing_steps,
     scale_recipe,
-    settings_of,
     without,
 )
 from minisplat_ref.training.smaller_views import SIDE_MIN, halve_large_views

@@ -42,7 +42,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, Request, activate
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
-from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Floats, Ints, Model, Scene, View
 
 SIZE: dict[str, Any] = {"n_views": 16, "width": 96, "height": 72, "n_points": 2_000}  # of the room

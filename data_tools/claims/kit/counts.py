@@ -18,7 +18,8 @@ from data_tools.claims.kit.figures import with_deviation
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import CPU
-from minisplat_ref.training.schedule import Recipe, configure
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import NOTHING, Scene
 
 MEASURES = {"n_gaussians": 0, "psnr": 2, "flat": 2, "textured": 2}
@@ -32,7 +33,7 @@ class Curve(NamedTuple):
     recipe: str
     """Its name."""
     points: tuple[Mapping[str, float], ...]
-    """What :func:`~minisplat_ref.training.schedule.configure` changes in each."""
+    """What :func:`~minisplat_ref.training.recipe_settings.configure` changes in each."""
     color: str
     common: Mapping[str, float] = NOTHING
     """What it changes in all."""

@@ -33,7 +33,7 @@ from minisplat_ref.mechanisms.motion.velocity import Warp, canonical_velocity, i
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, Request
 from minisplat_ref.rendering.backends import CPU
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Bools, Floats, Model, Scene, View
 
 N_CENTERS, DEGREE = 32, 3  # those of the recipe

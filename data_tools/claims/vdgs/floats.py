@@ -21,7 +21,8 @@ from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Scene
 
 HARMONICS = "harmonics"

@@ -36,7 +36,8 @@ from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, activate
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configure, scale_recipe
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, Scene, View, number_views, view_from
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 60.0  # pixels

@@ -87,6 +87,6 @@ def shows(ids: Ints, inside: Floats | Bools) -> Bools:
 
 
 def _dominant(coarse: Coarse, view: View) -> Ints:
-    output, _ = coarse.render_settings.render(coarse.model, view, frozenset({"stats"}))
+    output, _ = coarse.render_settings.render_view(coarse.model, view, frozenset({"stats"}))
     assert output.stats is not None
     return output.stats.dominant_ids

@@ -12,7 +12,7 @@ from minisplat_ref.io import formats
 from minisplat_ref.io.label import Label, warn_of_another
 from minisplat_ref.io.ply import further_properties, read_label
 from minisplat_ref.training.compensation import COMPENSATION
-from minisplat_ref.training.schedule import configure_renderer, renderer_settings
+from minisplat_ref.training.recipe_settings import configure_renderer, renderer_settings
 from minisplat_ref.training.sky import SKY
 from minisplat_ref.types import Gaussians
 

@@ -15,7 +15,8 @@ from minisplat_ref.extensions.extension import CORE, Extension, owner_of
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import get_backend
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.schedule import Recipe, as_trained
+from minisplat_ref.training.recipe_settings import match_calibrations
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Model, Scene, number_views
 
 N_FOLDS = 3  # parts of the training views, each of which is held out once
@@ -96,7 +97,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     run = Run(
         folder,
         settings,
-        as_trained(recipe, saved.model),
+        match_calibrations(recipe, saved.model),
         owner_of(settings.recipe, settings.extension) or CORE,
         photographs._replace(train_views=number_views(photographs.train_views)),
         saved.model,
@@ -121,7 +122,7 @@ def check_renderer(run: Run) -> None:
     """Refuse a renderer without the blend weight of each row."""
     settings, reason = run.render_settings, ""
     try:
-        if settings.render(run.model, run.scene.train_views[0], frozenset({"stats"}))[0].stats is not None:
+        if settings.render_view(run.model, run.scene.train_views[0], frozenset({"stats"}))[0].stats is not None:
             return
     except InputError as error:
         reason = f" ({error})"

@@ -21,7 +21,7 @@ from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.metrics.lpips import Network
 from minisplat_ref.rendering import Renderer, RenderSettings, Request
 from minisplat_ref.rendering.backends import get_backend
-from minisplat_ref.training.schedule import as_trained
+from minisplat_ref.training.recipe_settings import match_calibrations
 from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
 
@@ -45,7 +45,7 @@ class Trained(NamedTuple):
 
 def renderer_of(settings: Settings, model: Model) -> Renderer:
     """Return the model of a run with its renderer: with the sky that it has been given, too."""
-    return as_trained(recipe_of(settings), model).renderer
+    return match_calibrations(recipe_of(settings), model).renderer
 
 
 def load_trained(folder: Path) -> Trained:

@@ -38,7 +38,8 @@ from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics.lpips import Network, check_views, load_network
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.calibration import SHIFTS
-from minisplat_ref.training.schedule import Recipe, configure, describe, parse_settings, settings_of
+from minisplat_ref.training.recipe_settings import configure, parse_settings, settings_of
+from minisplat_ref.training.schedule import Recipe, describe
 from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}

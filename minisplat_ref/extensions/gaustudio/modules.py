@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from minisplat_ref.extensions.gaustudio.method import RECIPE
-from minisplat_ref.training.schedule import alternatives_of, settings_of
+from minisplat_ref.training.recipe_settings import find_alternatives, settings_of
 
 STAGES = {
     "initialiser": "the Gaussians with which a training begins",
@@ -47,7 +47,8 @@ def all_stages() -> tuple[Stage, ...]:
     """Return the stages of a training."""
     present = settings_of(RECIPE)
     return tuple(
-        Stage(name, summary, present[name].__name__, alternatives_of(present[name])) for name, summary in STAGES.items()
+        Stage(name, summary, present[name].__name__, find_alternatives(present[name]))
+        for name, summary in STAGES.items()
     )
 
 

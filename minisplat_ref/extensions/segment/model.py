@@ -15,8 +15,8 @@ from minisplat_ref.io.ply_file import read_vertices
 from minisplat_ref.io.run_files import model_file, read_cameras
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.rendering import Renderer
+from minisplat_ref.training.recipe_settings import configure_renderer
 from minisplat_ref.training.representation import nothing_shared
-from minisplat_ref.training.schedule import configure_renderer
 from minisplat_ref.types import Bools, Ints
 
 COLUMN = "label"

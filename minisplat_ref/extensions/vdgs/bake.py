@@ -37,8 +37,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.ply import read_label, save_ply
     from minisplat_ref.io.run_files import CAMERAS, POINT_CLOUD
     from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
+    from minisplat_ref.training.recipe_settings import find_alternatives
     from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
-    from minisplat_ref.training.schedule import alternatives_of
 
     folder, checkpoint = args.run_folder, args.run_folder / "checkpoint.npz"
     if not folder.is_dir():
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{folder} has no view {args.view}: choose from {', '.join(sorted(cameras))}")
     bundles, frame = read_bundles(checkpoint, arrays, Gaussians), read_frame(checkpoint, metadata)
     chosen = dict(setting.split("=", 1) for setting in read_label(folder / POINT_CLOUD).set)
-    modulation = alternatives_of(opacity_times)[chosen.get("modulation", opacity_times.__name__)]
+    modulation = find_alternatives(opacity_times)[chosen.get("modulation", opacity_times.__name__)]
     model = Model(bundles.gaussians, bundles.shared)
     seen, _ = as_seen(model, place_camera(cameras[args.view], frame), modulation(), IN_NUMPY)
     save_ply(args.out, Gaussians(**return_fields(seen._asdict(), VIEW_DEPENDENT.units, frame)))

@@ -30,7 +30,7 @@ def evaluate_held_out(
     gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
     for index, gain in zip(ids, gains.astype(np.float32), strict=True):
         view = views[index].load()
-        output, _ = iteration.render_settings.render(state.model, view)
+        output, _ = iteration.render_settings.render_view(state.model, view)
         image = np.clip(gain * output.image, 0.0, 1.0)
         psnrs.append(psnr(image, view.image, view.mask))
         if has_ssim:

@@ -25,7 +25,7 @@ from minisplat_ref.io.ply import COLORS, write_vertices
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train as train_state
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
 from photo_scenes import write_colmap
 from tolerances import ROUNDED_TO_FLOAT32
 

@@ -30,7 +30,8 @@ from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import At, action_name, configure, does, firing_steps, settings_of
+from minisplat_ref.training.recipe_settings import configure, settings_of
+from minisplat_ref.training.schedule import At, action_name, does, firing_steps
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import number_views
 

@@ -15,7 +15,8 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
-from minisplat_ref.training.schedule import action_name, settings_of
+from minisplat_ref.training.recipe_settings import settings_of
+from minisplat_ref.training.schedule import action_name
 from scenes import make_gaussians
 
 

@@ -14,7 +14,7 @@ from data_tools.claims.kit.detail import halves_of, quality
 from minisplat_ref.app.cli import main
 from minisplat_ref.interface.palette import RED
 from minisplat_ref.metrics import ViewMetrics
-from minisplat_ref.training.schedule import settings_of
+from minisplat_ref.training.recipe_settings import settings_of
 from minisplat_ref.types import Model, Scene, view_from
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM

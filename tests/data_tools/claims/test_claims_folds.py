@@ -13,7 +13,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import ViewMetrics
-from minisplat_ref.training.schedule import settings_of
+from minisplat_ref.training.recipe_settings import settings_of
 
 SIZE = {"n_views": 8, "width": 48, "height": 36, "n_points": 300}
 

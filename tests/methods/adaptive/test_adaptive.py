@@ -34,8 +34,8 @@ from minisplat_ref.training.pace import (
     to_metadata,
     trained_ids,
 )
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import Iteration
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}

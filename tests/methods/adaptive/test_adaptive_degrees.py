@@ -27,8 +27,8 @@ from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids
 from minisplat_ref.training.rates import present_degrees
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import DEGREES
 from minisplat_ref.types import Camera, Gaussians, Scene, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians

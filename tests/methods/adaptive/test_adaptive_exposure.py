@@ -15,8 +15,9 @@ from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import At, Every, configure
+from minisplat_ref.training.schedule import At, Every
 from minisplat_ref.types import Scene, View
 from scenes import as_dtype, make_camera, make_gaussians
 

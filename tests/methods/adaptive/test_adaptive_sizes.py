@@ -14,8 +14,8 @@ from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.smaller_views import halve_large_views
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}

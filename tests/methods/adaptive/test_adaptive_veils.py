@@ -7,7 +7,8 @@ from minisplat_ref.methods.adaptive import veils
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.schedule import does, settings_of
+from minisplat_ref.training.recipe_settings import settings_of
+from minisplat_ref.training.schedule import does
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Gaussians, Scene, view_from
 from scenes import make_camera
