@@ -36,7 +36,7 @@ from data_tools.survey_errors import ERRORS, PlantedLine
 from minisplat_ref.app.runs.cluster import Workers
 from minisplat_ref.app.runs.worker import versions
 from minisplat_ref.errors import InputError
-from minisplat_ref.interface.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, add_worker_arguments, drop_workers, integer
 from minisplat_ref.interface.reporting import markdown_table
 
 PACKAGE = Path(minisplat_ref.__file__).parent
@@ -206,7 +206,7 @@ def main(words: Sequence[str]) -> int:
             with one_job(args.job):
                 survey_all(errors, args.commands, folder)
             return 0
-        elsewhere = hand_out(workers, without_workers(words), "data_tools.survey", "survey")
+        elsewhere = hand_out(workers, drop_workers(words), "data_tools.survey", "survey")
         with handing_out(elsewhere if workers.is_used else None):
             outcomes = survey_all(errors, args.commands, folder)
     print(as_markdown(outcomes))

@@ -65,13 +65,13 @@ _CALL = (
 _EQUALITY = (
     PlantedLine(
         "continues where T equals the stop",
-        "reference.hits:goes_on",
+        "reference.hits:is_accepted",
         "transmittances > conventions",
         "transmittances >= conventions",
     ),
     PlantedLine(
         "stops where T equals the stop, 3DGS's rule",
-        "reference.hits:goes_on",
+        "reference.hits:is_accepted",
         "transmittances >= conventions",
         "transmittances > conventions",
     ),
@@ -107,25 +107,25 @@ _EQUALITY = (
     ),
     PlantedLine(
         "kernels: the other rule of stopping",
-        "cpu.compositing.tile_state:frame_of",
+        "cpu.compositing.tile_state:pack_frame",
         "if conventions.stops_at_equality",
         "if not conventions.stops_at_equality",
     ),
     PlantedLine(
         "kernels: skip at alpha_min",
-        "cpu.compositing.tile_state:frame_of",
+        "cpu.compositing.tile_state:pack_frame",
         "conventions.alpha_min,",
         "np.nextafter(conventions.alpha_min, 1.0),",
     ),
     PlantedLine(
         "kernels: clamp at alpha_max",
-        "cpu.compositing.tile_state:frame_of",
+        "cpu.compositing.tile_state:pack_frame",
         "conventions.alpha_max if conventions.clamp_stops_shape_gradient",
         "np.nextafter(conventions.alpha_max, 0.0) if conventions.clamp_stops_shape_gradient",
     ),
     PlantedLine(
         "kernels: drawn on the near plane",
-        "cpu.projection:constants_of",
+        "cpu.projection:pack_constants",
         "conventions.near_plane, conv",
         "np.nextafter(conventions.near_plane, 0.0), conv",
     ),
@@ -149,7 +149,7 @@ _PROJECTION = (
     ),
     PlantedLine(
         "kernels: y clamped by the limit of x",
-        "cpu.projection:constants_of",
+        "cpu.projection:pack_constants",
         "(camera.height - cy) / camera.fy + margin * tan_y",
         "(camera.width - cx) / camera.fx + margin * tan_x",
     ),
@@ -249,7 +249,7 @@ _LOSS_AND_ADAM = (
     ),
     PlantedLine(
         "eps without its correction",
-        "training.adam:_update_of",
+        "training.adam:_field_update",
         "rule.eps * root",
         "rule.eps",
     ),

@@ -29,7 +29,8 @@ SH_C3 = (
 SH_DEGREE_MAX = 3
 
 INRIA_TILE = 16  # pixels; INRIA's rule of extent is stated in tiles of this size
-# px^4: least (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue, which makes that of a disc 0.3 px^2 too large.
+# px^4: minimum of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue, which makes that of a disc 0.3 px^2 too
+# large.
 INRIA_ROOT_MIN = 0.1
 # Pixels. The largest power of two that fits int32; float32 and float64 hold it exactly. Radii are clamped when they are
 # stored, after the boxes are computed: otherwise a Gaussian further outside the image than this, whose ellipse still
@@ -37,7 +38,7 @@ INRIA_ROOT_MIN = 0.1
 RADIUS_MAX = 2.0**30
 
 JACOBIAN_CLAMP = 1.3  # the EWA Jacobian is frozen beyond 1.3 x the half field of view: it explodes as 1/z^2 outside
-COMPENSATION_FLOOR = 0.005  # least factor of the antialiasing compensation, keeps its square root differentiable
+COMPENSATION_FLOOR = 0.005  # minimum factor of the antialiasing compensation, keeps its square root differentiable
 MEDIAN_TRANSMITTANCE = 0.5  # the median depth is that of the Gaussian that takes the transmittance below one half
 DEPTH_ALPHA_MIN = 1e-10  # a pixel of lower accumulated opacity is empty: its expected depth is 0, not 0/0
 
@@ -58,7 +59,7 @@ class Conventions(NamedTuple):
     name : str
         Name of the profile.
     near_plane, far_plane : float
-        A Gaussian is drawn when ``near_plane < z < far_plane`` (camera z of its mean, world units).
+        A Gaussian is rendered when ``near_plane < z < far_plane`` (camera z of its mean, world units).
     eps2d : float
         Low-pass added to both diagonal entries of the projected covariance (px^2).
     is_antialiased : bool
@@ -76,7 +77,7 @@ class Conventions(NamedTuple):
         True: a Gaussian reaches exactly as far as its alpha can be ``alpha_min``. False: INRIA's rule, all 16-pixel
         tiles touched by the square of half-side ``ceil(3 sqrt(lambda_max))`` around the mean, which cuts visible alpha.
     uses_principal_point : bool
-        False: INRIA's rule, ``cx = width / 2, cy = height / 2`` whatever the camera says.
+        False: INRIA's rule, ``cx = width / 2, cy = height / 2`` regardless of the camera's principal point.
     clamp_is_symmetric : bool
         Jacobian clamp at ``+-1.3 tan(fov / 2)`` (INRIA), or at 1.3 x each half field of view counted from the principal
         point plus 0.3 x the half width (gsplat). Equal for a centred principal point.

@@ -1,4 +1,4 @@
-"""The one exception for bad input, whose message says how to fix it, and the warning for doubtful input."""
+"""The one exception for bad input, whose message states the remedy, and the warning for doubtful input."""
 
 LINE_MAX = 1000  # characters of a message; the middle of a longer one is left out
 _TAIL = 250  # characters kept at the end, which says how to fix the input

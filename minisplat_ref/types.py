@@ -46,7 +46,7 @@ class Gaussians(NamedTuple):
 
 
 class Optics(NamedTuple):
-    """How a camera that is no pinhole bends directions; :mod:`minisplat_ref.mechanisms.cameras` has the functions."""
+    """The lens of a camera that is no pinhole; :mod:`minisplat_ref.mechanisms.cameras` has the functions."""
 
     model: str
     """``brown``, ``fisheye`` or ``orthographic``."""
@@ -74,7 +74,7 @@ class Camera(NamedTuple):
     height: int
     """Image height, pixels."""
     optics: Optics | None = None
-    """None of a pinhole. Others are drawn by renderers that say so (``Representation.takes_optics``)."""
+    """None for a pinhole. Other cameras need a renderer that supports them (``Representation.takes_optics``)."""
 
     @property
     def center(self) -> Floats:
@@ -136,7 +136,7 @@ def view_from(camera: Camera, *, name: str = "", time: float = 0.0) -> View:
 
 
 class Frame(NamedTuple):
-    """Where the coordinates of a scene in memory lie in its files' frame: ``x_file = origin + unit x``."""
+    """Origin and unit of a scene's coordinates in memory, in its files' frame: ``x_file = origin + unit x``."""
 
     origin: tuple[float, float, float]
     """In the files' frame and unit."""
@@ -162,7 +162,7 @@ class Scene(NamedTuple):
     point_colors: NDArray[np.uint8]
     """[P, 3] sRGB."""
     background: Floats
-    """[3] in [0, 1], the colour behind everything; black unless the data say otherwise."""
+    """[3] in [0, 1], the colour behind everything; black by default."""
     extent: float
     """1.1 x the largest distance of a training camera from their mean, world units: scales position learning rates."""
     frame: Frame = FILE_FRAME
@@ -183,7 +183,7 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Model(NamedTuple):
-    """What is trained and rendered: a population of primitives, and parameters that belong to none of them."""
+    """The trained parameters: a population of primitives, and parameters that belong to none of them."""
 
     gaussians: Any
     """A population: :class:`Gaussians`, or another NamedTuple of arrays [N, ...] whose first field is ``means``."""
@@ -217,11 +217,11 @@ class RenderOutput(NamedTuple):
     alpha: Floats
     """[H, W] accumulated opacity, 1 - final transmittance."""
     median_depth: Floats | None
-    """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
+    """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None unless requested."""
     stats: BlendStats | None
-    """Blend statistics; None if not asked for."""
+    """Blend statistics; None unless requested."""
     saved: Any = None
-    """What the backend saves for its gradient, which without it is slower but just as correct."""
+    """Intermediate results that the backend saves for its gradient; without them it is slower but just as correct."""
     visible_ids: Ints | None = None
     """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""
     extras: Mapping[str, Any] = NOTHING
@@ -251,7 +251,7 @@ class Primitives(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """What one camera sees of each Gaussian: its footprint in the image. Culled Gaussians have zeros everywhere."""
+    """The footprint of each Gaussian in the image of one camera. Culled Gaussians have zeros everywhere."""
 
     means2d: Floats
     """[N, 2] projected centres, pixels."""
@@ -264,7 +264,7 @@ class Projection(NamedTuple):
     agree to six digits, and float32 would leave one of the difference, or none.
     """
     opacities: Floats
-    """[N] opacities, multiplied by the antialiasing compensation where the conventions ask for it."""
+    """[N] opacities, multiplied by the antialiasing compensation where the conventions have it."""
     radii: Ints
     """[N, 2] int32 half-extents along x and y, pixels; 0 where culled."""
     boxes: Ints
@@ -272,7 +272,7 @@ class Projection(NamedTuple):
 
 
 class TileGrid(NamedTuple):
-    """How an image is divided into tiles; the last column and row of tiles may extend beyond the image."""
+    """The division of an image into tiles; the last column and row of tiles may extend beyond the image."""
 
     width: int
     """Image width, pixels."""
@@ -310,7 +310,7 @@ class TileBins(NamedTuple):
 
 
 class SurfacePoints(NamedTuple):
-    """Where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
+    """Points where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
 
     points: Floats
     """[H, W, 3] world frame; 0 where there is none."""
@@ -392,7 +392,7 @@ class CompositeGradient(NamedTuple):
 
 
 class BlendGradient(NamedTuple):
-    """Gradient of the loss with respect to what is blended, for any kind of primitives."""
+    """Gradient of the loss with respect to the inputs of blending, for primitives of any kind."""
 
     primitives: tuple[Floats, ...]
     """One array for each field of the primitives that has a derivative in their response."""

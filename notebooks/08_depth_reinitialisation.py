@@ -52,7 +52,7 @@ from minisplat_ref.strategy.depth_reinit import (
     midpoint_points,
     reinitial_points,
 )
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
@@ -216,7 +216,7 @@ plt.show()
 
 # %% tags=["rounding"]
 held_out = room_truth.scene.test_views[1]
-learned = from_points(points, np.round(255 * colors).astype(np.uint8), sh_degree=0)
+learned = gaussians_from_points(points, np.round(255 * colors).astype(np.uint8), sh_degree=0)
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.2))
 show(axes[0], held_out.image / 255, "a held-out photograph")
 show(axes[1], render(room, held_out.camera)[0].image, "trained")
@@ -330,7 +330,7 @@ print(f"{'scene':<12}" + "".join(f"{choice:>16}" for choice in ("trained", "pape
 for name in ("outdoor", "plain-wall"):
     for choice in ("paper", "vote", "vote, backdrop"):
         points, _, colors = drawn(name, GUARDED[choice])
-        begun = from_points(points, np.round(255 * colors).astype(np.uint8), sh_degree=0)
+        begun = gaussians_from_points(points, np.round(255 * colors).astype(np.uint8), sh_degree=0)
         train_from(begun, truths[name].scene, MORE_ITERATIONS, np.random.default_rng(0))
         after_psnrs[name, choice] = scored(begun, name)
     cells = "".join(f"{after_psnrs[name, choice]:>13.1f} dB" for choice in ("paper", "vote", "vote, backdrop"))

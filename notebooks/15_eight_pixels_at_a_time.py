@@ -40,7 +40,7 @@ from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.records import records_of
 from minisplat_ref.cpu.compositing.tile_rows import find_reached_rows
-from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, rows_of
+from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, marked_rows
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.lanes import WIDTH, load, store
 from minisplat_ref.reference.hits import tile_hits
@@ -83,7 +83,7 @@ slanted = footprint(np.array([15.3, 8.1]), 0.5, (5.5, 0.8), 0.8)
 alphas = np.zeros((TILE_HEIGHT, TILE_WIDTH))
 alphas[hits.ys, hits.xs] = hits.alphas[0]
 bits = reached(slanted)
-n_rows = len(list(rows_of(bits)))
+n_rows = len(list(marked_rows(bits)))
 
 figure, axis = plt.subplots(figsize=(9.5, 4.4))
 axis.imshow(
@@ -92,7 +92,7 @@ axis.imshow(
 for row in range(N_ROWS):
     corner = (row // TILE_HEIGHT * WIDTH, row % TILE_HEIGHT)
     axis.add_patch(Rectangle(corner, WIDTH, 1, fill=False, edgecolor="#e6e2dd", linewidth=0.7))
-for row in rows_of(bits):
+for row in marked_rows(bits):
     corner = (row // TILE_HEIGHT * WIDTH, row % TILE_HEIGHT)
     axis.add_patch(Rectangle(corner, WIDTH, 1, fill=False, edgecolor=BLUE, linewidth=1.6))
 x0, y0, x1, y1 = slanted.boxes[0]
@@ -255,10 +255,10 @@ mine = footprint(mean, slant, sigmas, opacity)
 figure, axis = plt.subplots(figsize=(6.5, 3.2))
 axis.set(xlim=(-0.3, TILE_WIDTH + 0.3), ylim=(TILE_HEIGHT + 0.3, -0.3), aspect="equal")
 draw_ellipses(axis, mean, covariances2d(mine)[0], np.sqrt(2 * np.log(max(255 * opacity, 1))), color=RED)
-for row in rows_of(reached(mine)):
+for row in marked_rows(reached(mine)):
     corner = (row // TILE_HEIGHT * WIDTH, row % TILE_HEIGHT)
     axis.add_patch(Rectangle(corner, WIDTH, 1, facecolor=BLUE, alpha=0.3, edgecolor="white"))
-axis.set(title=f"{len(list(rows_of(reached(mine))))} of 64 rows", xticks=range(0, 33, 8), yticks=range(0, 17, 4))
+axis.set(title=f"{len(list(marked_rows(reached(mine))))} of 64 rows", xticks=range(0, 33, 8), yticks=range(0, 17, 4))
 plt.show()
 
 # %% [markdown]
@@ -274,8 +274,8 @@ plt.show()
 #
 # ```python
 # column_20 = ((1 << 16) - 1) << 32
-# assert all(row // TILE_HEIGHT == 2 for row in rows_of(np.uint64(column_20)))
-# assert len(list(rows_of(np.uint64(column_20)))) == TILE_HEIGHT
+# assert all(row // TILE_HEIGHT == 2 for row in marked_rows(np.uint64(column_20)))
+# assert len(list(marked_rows(np.uint64(column_20)))) == TILE_HEIGHT
 # ```
 #
 # </details>
@@ -308,7 +308,7 @@ plt.show()
 
 # %%
 looked = np.zeros((TILE_HEIGHT, TILE_WIDTH), bool)
-for row in rows_of(bits):
+for row in marked_rows(bits):
     x = row // TILE_HEIGHT * WIDTH
     looked[row % TILE_HEIGHT, x : x + WIDTH] = True
 assert looked[alphas > 0].all() and (alphas > 0).sum() > 50  # no hit is missed

@@ -35,7 +35,7 @@ from matplotlib.collections import PolyCollection
 from data_tools.claims.analytic import OPACITY, approximations, covariance, truth
 from data_tools.claims.cuts import card
 from data_tools.claims.fans.profile import fan_profile, profile_error
-from data_tools.claims.kit import floats_of, psnr_of
+from data_tools.claims.kit import count_floats, psnr_of
 from data_tools.claims.mixed import fit
 from data_tools.claims.polygons import edits as polygon_claims
 from data_tools.claims.rays.demo import ball as ball_of_discs
@@ -97,8 +97,8 @@ for degree in range(4):
 tries = [card.fit_card(card.Target(ball, lambda rows: rows), 5, False, 1500, seed) for seed in (0, 2)]
 five = max(tries, key=lambda population: psnr_of(card.render_card(population), ball))
 
-pictures = {f"degree {degree}": (drawn(g), floats_of(g)) for degree, g in textured.items()}
-pictures["five plain"] = (card.render_card(five), 5 * floats_of(one))
+pictures = {f"degree {degree}": (drawn(g), count_floats(g)) for degree, g in textured.items()}
+pictures["five plain"] = (card.render_card(five), 5 * count_floats(one))
 figure, axes = plt.subplots(1, 6, figsize=(11, 2.4))
 show(axes[0], ball, "a soft ball")
 for panel, (name, (image, n_floats)) in zip(axes[1:], pictures.items(), strict=True):
@@ -473,8 +473,8 @@ plt.show()
 #
 # ```python
 # for degree in range(4):
-#     assert floats_of(textured[degree]) == 14 + 4 * ((degree + 1) ** 2 - 1)
-# assert floats_of(textured[2]) < 5 * 14 < floats_of(textured[3])
+#     assert count_floats(textured[degree]) == 14 + 4 * ((degree + 1) ** 2 - 1)
+# assert count_floats(textured[2]) < 5 * 14 < count_floats(textured[3])
 # ```
 #
 # </details>

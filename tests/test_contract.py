@@ -27,9 +27,9 @@ KERNEL_PARTS = {"gaussian_rows", "memory"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {
-    "projection.pose_of": "the point that the camera maps to 0, in float64; the reference adds t instead",
-    "projection.constants_of": "conventions as float64 scalars",
-    "depth.intrinsics_of": "the camera's four numbers as an array",
+    "projection.pack_pose": "the point that the camera maps to 0, in float64; the reference adds t instead",
+    "projection.pack_constants": "conventions as float64 scalars",
+    "depth.pack_intrinsics": "the camera's four numbers as an array",
     "compositing.composite_with": "the exponential is an argument, which compositing.exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
 }

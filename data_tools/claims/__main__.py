@@ -9,7 +9,7 @@ from data_tools.claims.kit.claim import Claim
 from data_tools.claims.kit.records import hand_out, handing_out, one_job
 from minisplat_ref.app.cli.guard import check_packages, run_guarded
 from minisplat_ref.app.runs.cluster import Workers
-from minisplat_ref.interface.arguments import HelpFormatter, Parser, add_worker_arguments, integer, without_workers
+from minisplat_ref.interface.arguments import HelpFormatter, Parser, add_worker_arguments, drop_workers, integer
 
 PROGRAM = "data_tools.claims"
 DESCRIPTION = """\
@@ -49,7 +49,7 @@ def _run(words: Sequence[str]) -> int:
             claim.run(given)
         return 0
     workers = Workers(given.workers, given.cluster)
-    elsewhere = hand_out(workers, without_workers(words), PROGRAM) if workers.is_used else None
+    elsewhere = hand_out(workers, drop_workers(words), PROGRAM) if workers.is_used else None
     with handing_out(elsewhere):
         return claim.run(given) or 0
 

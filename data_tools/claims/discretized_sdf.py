@@ -35,7 +35,7 @@ from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
-from minisplat_ref.strategy.initialization import from_means
+from minisplat_ref.strategy.initialization import gaussians_from_means
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Bools, Camera, Floats, Model, Scene, View, number_views, view_from
@@ -110,7 +110,7 @@ def noisy_sphere(rng: np.random.Generator) -> SDFSurfels:
     z, phi = 1 - 2 * i / N_SURFELS, np.pi * (1 + 5**0.5) * i
     normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=1)
     means = (1 + rng.uniform(-OFFSET, OFFSET, size=N_SURFELS))[:, None] * normals
-    g = with_distances(from_means(means, np.zeros((N_SURFELS, 3)), 0), rng, foreground=0.0)
+    g = with_distances(gaussians_from_means(means, np.zeros((N_SURFELS, 3)), 0), rng, foreground=0.0)
     size = np.full((N_SURFELS, 3), np.log(0.7 * np.sqrt(4 * np.pi / N_SURFELS)))
     quats = facing(normals, np.broadcast_to(np.eye(3), (N_SURFELS, 3, 3)))
     return g._replace(quats=quats, log_scales=size, distances=0.5 * rng.uniform(-OFFSET, OFFSET, size=N_SURFELS))

@@ -27,7 +27,7 @@ from minisplat_ref.mechanisms.fusion.kernels import fuse
 from minisplat_ref.mechanisms.fusion.volume import DepthMap, Grid, empty_volume
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.reference.pinhole import points_at
+from minisplat_ref.reference.pinhole import unproject_depth
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import Recipe
@@ -85,7 +85,7 @@ def start(scene: Scene, recipe: Recipe, mesh: Mesh, per_face: int, seed: int) ->
 def true_points(made: SyntheticScene) -> Floats:
     """Return the points [P, 3] of the surface that the pixels of the training views show."""
     shown = zip(made.train_depths, made.scene.train_views, strict=True)
-    return np.concatenate([points_at(depth, view.camera) for depth, view in shown])
+    return np.concatenate([unproject_depth(depth, view.camera) for depth, view in shown])
 
 
 def depths_of(gaussians: Gaussians, made: SyntheticScene) -> Sequence[Floats]:

@@ -28,7 +28,7 @@ from minisplat_ref.interface.palette import SERIES
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.viewpoints import scene_viewpoints
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.reference.pinhole import points_at
+from minisplat_ref.reference.pinhole import unproject_depth
 from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import FILE_FRAME
@@ -77,7 +77,7 @@ def true_surface(made: SyntheticScene) -> OrientedPoints:
     normals = np.concatenate([made.train_normals, made.test_normals])
     points, directions = [], []
     for view, depth, normal in zip(views, depths, normals, strict=True):
-        points.append(points_at(depth, view.camera))
+        points.append(unproject_depth(depth, view.camera))
         directions.append(normal[depth != 0])
     every, rng = np.concatenate(points), np.random.default_rng(0)
     chosen = rng.choice(len(every), min(N_POINTS, len(every)), replace=False)

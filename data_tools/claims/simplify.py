@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     changes = collect_removal_costs(dense, scene.train_views, RenderSettings(scene.background)).changes
     weights = dict.fromkeys(CHOICES, importance) | {CHANGE: np.where(importance > 0, changes, 0)}
     counts = counts_to_keep(importance, args.fractions)
-    tuning = kit.without_events(get_recipe(FINE_TUNING, args.fine_tune))
+    tuning = kit.drop_events(get_recipe(FINE_TUNING, args.fine_tune))
     runs = []
     jobs = [(kept, choice, seed) for kept in counts for choice in CHOICES for seed in args.seeds]
     for kept, choice, seed in kit.with_progress(jobs, "fine-tunings"):

@@ -21,7 +21,7 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.style.styling import Plan, stylise
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
-from minisplat_ref.reference.pinhole import points_at, project_into_image
+from minisplat_ref.reference.pinhole import project_into_image, unproject_depth
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from
 
@@ -141,7 +141,7 @@ def disagreement(
     """Return the mean absolute difference of colours [P] at the pixels of one view whose point the other shows, too."""
     first, second = cameras
     y, x = np.nonzero(depths[0])
-    rows, xy, z = project_into_image(points_at(depths[0], first), second)
+    rows, xy, z = project_into_image(unproject_depth(depths[0], first), second)
     u, v = np.floor(xy).astype(int).T
     here, there = (y[rows], x[rows]), (v, u)
     is_same = np.abs(depths[1][there] - z) < DEPTH_TOLERANCE * z

@@ -176,7 +176,7 @@ def finest(n_floats: int, degree: int, rng: np.random.Generator) -> ReflectiveSu
 
 def floats_of(population: TexturedSurfels, degree: int) -> int:
     """Return the floats of one surfel whose light from around has harmonics of a degree."""
-    return kit.floats_of(population) + 3 * ((degree + 1) ** 2 - 1)
+    return kit.count_floats(population) + 3 * ((degree + 1) ** 2 - 1)
 
 
 def render_maps(population: TexturedSurfels, camera: Camera) -> tuple[Floats, Floats]:

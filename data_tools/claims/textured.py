@@ -62,9 +62,9 @@ def outcomes(whole: Gaussians, scene: Scene, fine_tuned: Callable[[Any], Any]) -
     jobs: list[tuple[str, str, int, Any]] = [("all", PLAIN, 0, whole)]
     jobs += [("all", PAPER, degree, prepare(whole, degree, True)) for degree in (1, 2, 3)]
     jobs.append(("all", BOTH, 3, prepare(whole, 3, False)))
-    n_floats = len(whole.means) * kit.floats_of(whole)
+    n_floats = len(whole.means) * kit.count_floats(whole)
     for form, replaces in ((PAPER, True), (BOTH, False)):
-        n = n_floats // kit.floats_of(prepare(whole, 3, replaces))
+        n = n_floats // kit.count_floats(prepare(whole, 3, replaces))
         kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
         jobs.append(("as many floats", form, 3, prepare(kept, 3, replaces)))
     rows = []
@@ -77,7 +77,7 @@ def outcomes(whole: Gaussians, scene: Scene, fine_tuned: Callable[[Any], Any]) -
                 "form": form,
                 "degree": degree,
                 "n_gaussians": len(population.means),
-                "n_floats": len(population.means) * kit.floats_of(population),
+                "n_floats": len(population.means) * kit.count_floats(population),
                 "psnr": test.psnr,
                 "ssim": test.ssim,
                 "training_psnr": training.psnr,

@@ -32,7 +32,7 @@ from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.golden import files as golden
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
@@ -116,7 +116,7 @@ def _write_transforms(folder: Path) -> None:
     write_image(folder / "masks" / "0.png", np.ones(view.image.shape[:2], bool))
     frames[0] |= {"mask_path": "masks/0.png", "k1": 0.01, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0, "time": 0.5}
     frames[1] |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "camera_model": "OPENCV"}
-    save_ply(folder / "points.ply", from_points(scene.points, scene.point_colors, 0))
+    save_ply(folder / "points.ply", gaussians_from_points(scene.points, scene.point_colors, 0))
     top = {"fl_x": camera.fx, "w": camera.width, "h": camera.height, "is_fisheye": False, "ply_file_path": "points.ply"}
     (folder / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
 

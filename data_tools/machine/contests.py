@@ -19,7 +19,7 @@ class Contest(NamedTuple):
 
 def in_ms(times: Times) -> dict[str, Figure]:
     """Return both times as figures."""
-    return {"ms": 1e3 * times.least, "median ms": 1e3 * times.median}
+    return {"ms": 1e3 * times.minimum, "median ms": 1e3 * times.median}
 
 
 def time_contests(contests: Sequence[Contest], repeats: int) -> list[Case]:

@@ -71,9 +71,9 @@ def _adam(name: str, is_seen: Bools, is_visible_only: bool) -> Contest:
         step, copy = times
         figures: dict[str, Figure] = {
             **in_ms(step),
-            "GB/s": n_bytes / step.least / 1e9,
-            "copy GB/s": n_bytes / copy.least / 1e9,
-            "x copy": step.least / copy.least,
+            "GB/s": n_bytes / step.minimum / 1e9,
+            "copy GB/s": n_bytes / copy.minimum / 1e9,
+            "x copy": step.minimum / copy.minimum,
         }
         has_moved = all(np.array_equal((field < 0.5).all(axis=1), is_seen) for field in gaussians)
         passed = has_moved and bool((target == 1).all())
@@ -158,7 +158,7 @@ def _contest(name: str, tasks: tuple[Task, ...], error: float, bound: float, oth
     note = "" if error <= bound else f"off by {error:.1e}, more than {bound:.1e}"
 
     def judge(times: Sequence[Times]) -> list[Case]:
-        others: dict[str, Figure] = {f"{other} ms": 1e3 * own.least for own in times[1:]}
+        others: dict[str, Figure] = {f"{other} ms": 1e3 * own.minimum for own in times[1:]}
         return [Case(f"stage/{name}", not note, {**in_ms(times[0]), **others, "error": error}, note)]
 
     return Contest(tasks, judge)

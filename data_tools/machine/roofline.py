@@ -21,13 +21,13 @@ from minisplat_ref.cpu.compositing.exponential import exp_fast
 from minisplat_ref.cpu.compositing.tile_rows import (
     ALPHAS,
     SCRATCH_SIZE,
-    sigma_of,
+    mean_offset_y,
+    ridge_offsets,
+    row_sigma,
     start_scratch,
-    to_mean_y,
-    to_ridge,
     write_lines,
 )
-from minisplat_ref.cpu.compositing.tile_state import N_ROWS, frame_of, start_tile
+from minisplat_ref.cpu.compositing.tile_state import N_ROWS, pack_frame, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
@@ -71,7 +71,7 @@ def _forward_line(drawn, hit, frame, n_hits, n_passes):  # type: ignore[no-untyp
         for _ in range(n_hits):
             write_lines(scratch, hit.x, hit.y, hit.slope, hit.half_pivot)
             for row in range(N_ROWS):
-                alpha = hit.opacity * exp_fast(-sigma_of(scratch, row, hit.half_a))
+                alpha = hit.opacity * exp_fast(-row_sigma(scratch, row, hit.half_a))
                 store(scratch, ALPHAS + row * WIDTH, alpha)
             for row in range(N_ROWS):
                 i = row * DRAWN_FIELDS * WIDTH
@@ -100,12 +100,12 @@ def _backward_line(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[n
         for _ in range(n_hits):
             write_lines(scratch, hit.x, hit.y, hit.slope, hit.half_pivot)
             for row in range(N_ROWS):
-                alpha = hit.opacity * exp_fast(-sigma_of(scratch, row, hit.half_a))
+                alpha = hit.opacity * exp_fast(-row_sigma(scratch, row, hit.half_a))
                 store(scratch, ALPHAS + row * WIDTH, alpha)
             q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
             for row in range(N_ROWS):
                 i = row * SHADED_FIELDS * WIDTH
-                e, dy = to_ridge(scratch, row), to_mean_y(scratch, row)
+                e, dy = ridge_offsets(scratch, row), mean_offset_y(scratch, row)
                 unclamped = load(scratch, ALPHAS + row * WIDTH)
                 transmittance = load(state, i)
                 after, weight = blend(transmittance, unclamped, frame)
@@ -161,12 +161,12 @@ def blending(workload: Workload) -> Contest:
             ("forward", times[0], times[1], lines.image_error(), BENCH_FLOAT32_IMAGE),
             ("backward", times[2], times[3], lines.gradient_error(), BENCH_FLOAT32_GRADIENT),
         ):
-            own_time, roof = own.least * n_threads() / n_evaluations, line.least * n_threads() / lines.n_evaluations
+            own_time, roof = own.minimum * n_threads() / n_evaluations, line.minimum * n_threads() / lines.n_evaluations
             figures: dict[str, Figure] = {
                 **in_ms(own),
                 "million hits": n_hits / 1e6,
                 "million evaluations": n_evaluations / 1e6,
-                "million evaluations/s": n_evaluations / own.least / 1e6,
+                "million evaluations/s": n_evaluations / own.minimum / 1e6,
                 "ns per evaluation and core": 1e9 * own_time,
                 "straight line ns": 1e9 * roof,
                 "x straight line": own_time / roof,
@@ -204,7 +204,7 @@ class StraightLines:
         )
         self.colors, self.background = np.tile(color, (n, 1)), np.zeros(3)
         self.bins = REFERENCE.bin_gaussians(self.projection, grid, GSPLAT_MAIN)
-        self.frame = frame_of(self.bins, GSPLAT_MAIN, np.dtype(f32))
+        self.frame = pack_frame(self.bins, GSPLAT_MAIN, np.dtype(f32))
         self.expected = REFERENCE.composite(self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN)
         self.v_image = np.random.default_rng(2).normal(size=self.expected.image.shape).astype(f32)
         self.drawn = np.zeros((n_copies, N_ROWS, DRAWN_FIELDS, WIDTH), f32)

@@ -66,7 +66,7 @@ def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) ->
         views.append(_view(synth(n, width, height, FOCAL_OF_WIDTH * width)))
     report("slopes: taking turns")
     [times] = time_interleaved([[view.draw for view in views]], 1, repeats)
-    least = [view.least for view in times]
+    least = [view.minimum for view in times]
     cases = [_case(view, seconds) for view, seconds in zip(views, least, strict=True)]
     sizes = [(len(v.workload.gaussians.means), v.workload.camera.width * v.workload.camera.height) for v in views]
     hits = [view.n_hits for view in views]

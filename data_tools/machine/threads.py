@@ -9,7 +9,7 @@ import numpy as np
 
 from data_tools.machine.contests import Contest
 from data_tools.machine.roofline import StraightLines
-from minisplat_ref.bench.interleaving import Times, seconds_of
+from minisplat_ref.bench.interleaving import Times, measure_seconds
 from minisplat_ref.bench.profiling import REST, WHOLE, time_stages
 from minisplat_ref.bench.training_time import WARM_UP, load_or_make_scene
 from minisplat_ref.bench.workloads import Workload
@@ -56,7 +56,7 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
                         scene, recipe._replace(iterations=step), seed=0, state=state, backend=time_stages(CPU, seconds)
                     )
                     total = time.perf_counter() - start
-                    line = seconds_of(lines.forward)
+                    line = measure_seconds(lines.forward)
                     measured[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
     finally:
         numba.set_num_threads(n_all)
@@ -93,7 +93,7 @@ def threads(workload: Workload) -> list[Contest]:
             numba.set_num_threads(n_all)
 
     def judge(times: Sequence[Times]) -> list[Case]:
-        one, all_ = (1e3 * own.least for own in times)
+        one, all_ = (1e3 * own.minimum for own in times)
         is_same = all(np.array_equal(a, b) for a, b in zip(gradient(1), gradient(n_all), strict=True))
         figures: dict[str, Figure] = {"1 thread ms": one, f"{n_all} threads ms": all_, "x": one / all_}
         note = "" if is_same else "the gradients are not the same bytes"

@@ -1,7 +1,7 @@
 """Times and errors in one run: contenders that are wrong are not timed, all others are timed alternately.
 
 The machine's other work and its clock rate change from minute to minute. So every round runs each contender once, and
-the report has the median and the least of its times; their ratios are more reliable than the times themselves.
+the report has the median and the minimum of its times; their ratios are more reliable than the times themselves.
 """
 
 import time
@@ -106,10 +106,10 @@ def _time_once(entry: Entry, workload: Workload) -> None:
         return
     start = time.perf_counter()
     _, tape = forward(contender, workload)
-    drawn = time.perf_counter()
+    rendered = time.perf_counter()
     backward(contender, tape, workload.v_image)
-    times.forward.append(drawn - start)
-    times.backward.append(time.perf_counter() - drawn)
+    times.forward.append(rendered - start)
+    times.backward.append(time.perf_counter() - rendered)
 
 
 def _case(workload: Workload, entry: Entry, baseline: Times) -> Case:

@@ -107,7 +107,7 @@ def choose(names: tuple[str, ...] | None) -> list[Contender]:
     if names is None:
         return list(contenders.values())
     names = tuple(name for given in names for name in (ON_GPU if given == CUDA else (given,)))
-    contenders = contenders | {name: _on_gpu(name) for name in names if name in ON_GPU}
+    contenders = contenders | {name: _gpu_contender(name) for name in names if name in ON_GPU}
     for name in names:
         if name not in contenders:
             raise InputError(f"contender {name!r} is unknown; choose from {', '.join((*contenders, CUDA))}")
@@ -118,7 +118,7 @@ ON_GPU = {"cuda-f32": CUDA, "cuda-atomic-f32": CUDA_ATOMIC}
 """Contenders that need a GPU, only where they are named; ``cuda`` stands for both. Their times include copying."""
 
 
-def _on_gpu(name: str) -> Contender:
+def _gpu_contender(name: str) -> Contender:
     """Return a contender for a GPU.
 
     Raises

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.bench.interleaving import Times, seconds_of, time_interleaved
+from minisplat_ref.bench.interleaving import Times, measure_seconds, time_interleaved
 from minisplat_ref.bench.textbook import TEXTBOOK
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.extensions.extension import CORE, Extension
@@ -80,13 +80,16 @@ def extension_cases(
     for row in references:
         report(f"{workload.name}: {row.name}")
         steps: _Steps = _Steps(row, workload)
-        own_times[row.name] = Times(*[seconds_of(steps.forward)] * 2), Times(*[seconds_of(steps.backward)] * 2)
+        own_times[row.name] = (
+            Times(*[measure_seconds(steps.forward)] * 2),
+            Times(*[measure_seconds(steps.backward)] * 2),
+        )
         answers[row.extension.name] = steps.answer()
     report(f"{workload.name}: {len(kernels)} renderers, interleaved")
     tasks = [_Steps(row, workload) for row in kernels]
     times = time_interleaved([[s.forward for s in tasks], [s.backward for s in tasks]], repeats, 1)
     of = {row.name: pair for row, *pair in zip(kernels, *times, strict=True)}
-    baseline = sum(time.least for time in of[BASELINE])
+    baseline = sum(time.minimum for time in of[BASELINE])
     cases = [_case(workload, row, own_times[row.name], None, baseline) for row in references]
     for row, steps in zip(kernels, tasks, strict=True):
         errors = _errors(steps.answer(), answers[row.extension.name])
@@ -152,8 +155,8 @@ def _case(workload: Workload, row: Row, times: Sequence[Times], errors: _Errors 
     figures = {
         "forward (ms)": MILLI * forward.median,
         "backward (ms)": MILLI * backward.median,
-        "least of both (ms)": MILLI * (forward.least + backward.least),
-        "x textbook": baseline / (forward.least + backward.least),
+        "least of both (ms)": MILLI * (forward.minimum + backward.minimum),
+        "x textbook": baseline / (forward.minimum + backward.minimum),
         "image max": errors.image_max if errors else None,
         "pixels off (%)": 100 * errors.off if errors else None,
         "RMS of the others": errors.image_rms if errors else None,

@@ -2,7 +2,7 @@
 
 A shared machine is disturbed for seconds at a time: other work slows a thread down, and makes a second thread gain
 less. Tasks timed one after the other would each run under other conditions. So tasks that are compared alternate, and
-all run in every round. The least time is that of an idle machine, the median that of this machine as it is used.
+all run in every round. The minimum is the time of an idle machine, the median the time of this machine as it is used.
 """
 
 import statistics
@@ -14,13 +14,13 @@ Task = Callable[[], object]
 
 
 class Times(NamedTuple):
-    """Of one task, in seconds."""
+    """Times of one task, in seconds."""
 
-    least: float
+    minimum: float
     median: float
 
 
-def seconds_of(task: Task) -> float:
+def measure_seconds(task: Task) -> float:
     """Run a task once and return the seconds that it took."""
     start = time.perf_counter()
     task()
@@ -48,5 +48,5 @@ def time_interleaved(groups: Sequence[Sequence[Task]], rounds: int, repeats: int
         for tasks, of_group in zip(groups, seconds, strict=True):
             for _ in range(repeats):
                 for task, own in zip(tasks, of_group, strict=True):
-                    own.append(seconds_of(task))
+                    own.append(measure_seconds(task))
     return [[Times(min(own), statistics.median(own)) for own in of_group] for of_group in seconds]

@@ -53,15 +53,15 @@ class Verdict(NamedTuple):
 
 
 def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPLAT_MAIN) -> Expected:
-    """Draw and differentiate in float64."""
+    """Render and differentiate in float64."""
     start = time.perf_counter()
     output, tape = render(workload.gaussians, workload.camera, conventions=conventions, backend=backend)
-    drawn = time.perf_counter()
+    rendered = time.perf_counter()
     gradient = render_vjp(tape, workload.v_image).gaussians
     differentiated = time.perf_counter()
     at = thresholds_of_view(tape.splats)
     quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
-    return Expected(output.image, gradient, quiet, at, drawn - start, differentiated - drawn)
+    return Expected(output.image, gradient, quiet, at, rendered - start, differentiated - rendered)
 
 
 def with_slack(expected: Expected, workload: Workload, conventions: Conventions, slack: float) -> Expected:
@@ -116,7 +116,7 @@ def failure(contender: Contender, verdict: Verdict) -> str:
 
 
 def forward(contender: Contender, workload: Workload) -> tuple[Floats, Any]:
-    """Draw; return the image and a tape for :func:`backward`."""
+    """Render; return the image and a tape for :func:`backward`."""
     gaussians = Gaussians._make(field.astype(contender.dtype, copy=False) for field in workload.gaussians)
     return contender.passes.forward(gaussians, workload.camera, contender.conventions, contender.backend)
 

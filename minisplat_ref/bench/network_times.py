@@ -48,7 +48,7 @@ def network_cases(repeats: int) -> list[Case]:
         times = time_interleaved(tasks, repeats, 1)
         worst = max(exact[work.name])
         figures = {
-            f"{step}, {kind} (ms)": MILLI * time.least
+            f"{step}, {kind} (ms)": MILLI * time.minimum
             for step, pair in zip(("forward", "gradient"), times, strict=True)
             for kind, time in zip(("NumPy", "kernel"), pair, strict=True)
         }

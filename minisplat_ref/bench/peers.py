@@ -18,7 +18,7 @@ from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
 GSPLAT_TORCH, OPENSPLAT = "gsplat-torch", "opensplat"
 
 
-def peers_of(names: Sequence[str]) -> tuple[list[Contender], Path | None]:
+def make_peers(names: Sequence[str]) -> tuple[list[Contender], Path | None]:
     """Make contenders of the peers.
 
     Parameters

@@ -39,7 +39,7 @@ def profile(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
     return profile_cases(seconds, total, iterations)
 
 
-def against_opensplat(program: Path, folder: Path, downscale: int, iterations: int) -> list[Case]:
+def compare_opensplat(program: Path, folder: Path, downscale: int, iterations: int) -> list[Case]:
     """Time training iterations of OpenSplat and ours alternately, on the same photographs from the same points."""
     scene = load_scene(folder, downscale=downscale, test_every=0, undistort=True)  # it withholds no view
     ours: list[float] = []
@@ -62,7 +62,7 @@ def against_opensplat(program: Path, folder: Path, downscale: int, iterations: i
 
 
 def _figures(seconds: list[float]) -> dict[str, Figure]:
-    """Return the median of the iterations, and the least of them."""
+    """Return the median and the minimum of the iterations' times."""
     return {"iteration ms": 1e3 * statistics.median(seconds), "least ms": 1e3 * min(seconds)}
 
 

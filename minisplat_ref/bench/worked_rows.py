@@ -16,9 +16,9 @@ from minisplat_ref.cpu.compositing.tile_state import (
     CHECK_EVERY,
     N_ROWS,
     corner,
-    frame_of,
+    marked_rows,
     open_rows,
-    rows_of,
+    pack_frame,
     start_tile,
 )
 from minisplat_ref.jit.compile import kernel
@@ -45,7 +45,7 @@ def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-d
                 is_open = open_rows(state, 1)
             rows = find_reached_rows(records, tile_ids, m, x0, y0) & is_open
             _write_alphas(scratch, rows, records, tile_ids[m], x0, y0)
-            for row in rows_of(rows):
+            for row in marked_rows(rows):
                 total += 1
                 after, _ = blend(load(state, row * WIDTH), load(scratch, ALPHAS + row * WIDTH), frame)
                 store(state, row * WIDTH, after)
@@ -55,5 +55,5 @@ def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-d
 def count_worked_rows(projection: Projection, channels: Floats, bins: TileBins) -> int:
     """Return the number of rows of eight pixels that the blending kernels compute, over all Gaussians and tiles."""
     records = records_of(projection, channels, GSPLAT_MAIN)
-    frame = frame_of(bins, GSPLAT_MAIN, records.dtype)
+    frame = pack_frame(bins, GSPLAT_MAIN, records.dtype)
     return int(_count_rows(records, bins.gaussian_ids, bins.tile_offsets, frame))

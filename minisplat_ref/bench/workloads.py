@@ -32,7 +32,7 @@ class Workload(NamedTuple):
     camera: Camera
     """View."""
     v_image: Floats
-    """[H, W, 3] derivative of a loss by the image: standard normal noise, float32 numbers as float64."""
+    """[H, W, 3] derivative of a loss with respect to the image: standard normal noise, float32 numbers as float64."""
 
 
 def synth(n: int = SYNTH_SIZE, width: int = 480, height: int = 270, focal: float = 400.0) -> Workload:

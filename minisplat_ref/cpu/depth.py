@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.projection import pose_of
+from minisplat_ref.cpu.projection import pack_pose
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.covariance import normalize, normalize_vjp, rotation_vjp
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
-from minisplat_ref.scalar.projection import dot, rows_of, transpose3
+from minisplat_ref.scalar.projection import dot, matrix_rows, transpose3
 from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
 
 
@@ -65,7 +65,7 @@ def _surface_points(
     means, quats, scales = ellipsoids
     centre = pose.centre
     for y in prange(dominant_ids.shape[0]):
-        R = rows_of(pose.R)
+        R = matrix_rows(pose.R)
         for x in range(dominant_ids.shape[1]):
             n = dominant_ids[y, x]
             if n < 0:
@@ -78,7 +78,7 @@ def _surface_points(
                     points[y, x, i] = centre[i] + t * d[i]
 
 
-def intrinsics_of(camera: Camera) -> Floats:
+def pack_intrinsics(camera: Camera) -> Floats:
     """Return fx, fy, cx and cy as an array [4]."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
 
@@ -87,14 +87,14 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
     """Densest point of each pixel's dominant Gaussian; see ``reference.depth.surface_points``."""
     out = SurfacePoints(np.zeros((*dominant_ids.shape, 3), means.dtype), np.zeros(dominant_ids.shape, means.dtype))
     ellipsoids = Ellipsoids(means, quats, scales)
-    _surface_points(ellipsoids, pose_of(camera), intrinsics_of(camera), dominant_ids, out.points, out.depths)
+    _surface_points(ellipsoids, pack_pose(camera), pack_intrinsics(camera), dominant_ids, out.points, out.depths)
     return out
 
 
 @scalar
 def _gaussian_vjp(n, pixels, ellipsoids, pose, intrinsics, depths, v_surface, v):
     """Write the gradient with respect to one Gaussian, the sum over its pixels."""
-    R = rows_of(pose.R)
+    R = matrix_rows(pose.R)
     quat = _wide(ellipsoids.quats[n])
     axes, scale, u = gaussian_axes(quat), _scale(ellipsoids.scales, n), _offset(ellipsoids.means, n, pose.centre)
     v_points, v_depths = v_surface
@@ -116,7 +116,7 @@ def _gaussian_vjp(n, pixels, ellipsoids, pose, intrinsics, depths, v_surface, v)
                 v_axes[k, i] += v_axis[i]
                 v_mean[i] += v_p * axes[k][i]
     w, x, y, z, inverse_length = normalize(*quat)
-    v_unit = rotation_vjp(w, x, y, z, transpose3(rows_of(v_axes)))
+    v_unit = rotation_vjp(w, x, y, z, transpose3(matrix_rows(v_axes)))
     v_quat = normalize_vjp((w, x, y, z), inverse_length, v_unit)
     for i in range(4):
         v.quats[n, i] = v_quat[i]
@@ -156,8 +156,8 @@ def surface_points_vjp(
     v = Ellipsoids(*(np.zeros(array.shape, array.dtype) for array in (means, quats, scales)))
     _surface_points_vjp(
         Ellipsoids(means, quats, scales),
-        pose_of(camera),
-        intrinsics_of(camera),
+        pack_pose(camera),
+        pack_intrinsics(camera),
         PixelLists(pixels, offsets),
         depths,
         SurfacePoints(v_points, v_depths),

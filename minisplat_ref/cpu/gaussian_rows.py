@@ -24,7 +24,7 @@ def contiguous(*tables: Floats) -> tuple[Floats, ...]:
 
 
 @scalar
-def rows_from(n, end):
+def eight_rows(n, end):
     """Return eight rows from ``n`` on, below ``end``."""
     last = end - 1
     near = n, min(n + 1, last), min(n + 2, last), min(n + 3, last)
@@ -51,7 +51,7 @@ def list_visible(radii, first, end, rows):
 
 
 @scalar
-def list_visible_of(radii, degrees, degree, first, end, rows):
+def list_visible_degree(radii, degrees, degree, first, end, rows):
     """List those of the visible Gaussians of a range whose colours have a degree; otherwise as ``list_visible``."""
     count = 0
     for n in range(first, end):
@@ -93,7 +93,7 @@ def add(sums, k, is_counted, lanes):
 
 
 @scalar
-def total_of(parts):
+def sum_parts(parts):
     """Return the sums [K] over all parts [n, K * 8], added in the order of the parts."""
     totals = np.empty(parts.shape[1] // WIDTH, np.float64)
     for k in range(totals.size):

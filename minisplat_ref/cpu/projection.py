@@ -18,11 +18,11 @@ from minisplat_ref.cpu.gaussian_rows import (
     DOUBLE,
     add,
     contiguous,
+    eight_rows,
     gather_wide,
     list_visible,
     load_rows,
-    rows_from,
-    total_of,
+    sum_parts,
     triple,
 )
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -39,9 +39,9 @@ from minisplat_ref.scalar.projection import (
     conic_vjp,
     dot,
     matmul3,
+    matrix_rows,
     project_gaussian,
     project_gaussian_vjp,
-    rows_of,
     to_camera,
     transpose3,
 )
@@ -50,7 +50,7 @@ from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Primitives, P
 N_CHUNKS = 64  # parts of the camera-gradient sum; fixed, so that its rounding does not depend on the thread count
 
 
-def pose_of(camera: Camera) -> Pose:
+def pack_pose(camera: Camera) -> Pose:
     """Return R and the point that R x + t maps to the origin, float64.
 
     The point is the camera centre. It is solved for rather than computed as -R^T t, so that R (x - point) equals
@@ -60,7 +60,7 @@ def pose_of(camera: Camera) -> Pose:
     return Pose(R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64)))
 
 
-def constants_of(camera: Camera, conventions: Conventions) -> ProjectionConstants:
+def pack_constants(camera: Camera, conventions: Conventions) -> ProjectionConstants:
     """Return camera intrinsics and conventions as float64 scalars."""
     cx, cy = camera.cx, camera.cy
     if not conventions.uses_principal_point:
@@ -88,7 +88,7 @@ def _quaternion(quats, rows):
 
 @scalar
 def _project_eight(rows, primitives, pose, constants, extent, out):
-    R = rows_of(pose.R)
+    R = matrix_rows(pose.R)
     x, y, z = triple(primitives.means, rows)
     p = to_camera(R, pose.centre, x, y, z)
     M = axes(_quaternion(primitives.quats, rows), triple(primitives.scales, rows))
@@ -101,23 +101,23 @@ def _project_eight(rows, primitives, pose, constants, extent, out):
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, extent.width, extent.height)
     reach = rx, ry, x0, y0, x1, y1
     is_drawn = is_seen(p[2], opacity, footprint, (a, b, c), reach, extent.alpha_min, constants)
-    _scatter_seen(is_drawn, out.means2d, rows, 0, footprint.x)
-    _scatter_seen(is_drawn, out.means2d, rows, 1, footprint.y)
-    _scatter_seen(is_drawn, out.depths, rows, 0, p[2])
-    _scatter_seen(is_drawn, out.conics, rows, 0, a)
-    _scatter_seen(is_drawn, out.conics, rows, 1, b)
-    _scatter_seen(is_drawn, out.conics, rows, 2, c)
-    _scatter_seen(is_drawn, out.opacities, rows, 0, opacity)
-    _scatter_seen(is_drawn, out.radii, rows, 0, rx)
-    _scatter_seen(is_drawn, out.radii, rows, 1, ry)
-    _scatter_seen(is_drawn, out.boxes, rows, 0, x0)
-    _scatter_seen(is_drawn, out.boxes, rows, 1, y0)
-    _scatter_seen(is_drawn, out.boxes, rows, 2, x1)
-    _scatter_seen(is_drawn, out.boxes, rows, 3, y1)
+    _scatter_visible(is_drawn, out.means2d, rows, 0, footprint.x)
+    _scatter_visible(is_drawn, out.means2d, rows, 1, footprint.y)
+    _scatter_visible(is_drawn, out.depths, rows, 0, p[2])
+    _scatter_visible(is_drawn, out.conics, rows, 0, a)
+    _scatter_visible(is_drawn, out.conics, rows, 1, b)
+    _scatter_visible(is_drawn, out.conics, rows, 2, c)
+    _scatter_visible(is_drawn, out.opacities, rows, 0, opacity)
+    _scatter_visible(is_drawn, out.radii, rows, 0, rx)
+    _scatter_visible(is_drawn, out.radii, rows, 1, ry)
+    _scatter_visible(is_drawn, out.boxes, rows, 0, x0)
+    _scatter_visible(is_drawn, out.boxes, rows, 1, y0)
+    _scatter_visible(is_drawn, out.boxes, rows, 2, x1)
+    _scatter_visible(is_drawn, out.boxes, rows, 3, y1)
 
 
 @scalar
-def _scatter_seen(is_drawn, table, rows, column, lanes):
+def _scatter_visible(is_drawn, table, rows, column, lanes):
     """Write lanes to a column, with zeros where a Gaussian is culled."""
     scatter(table, rows, column, select(is_drawn, lanes, ZERO))
 
@@ -132,7 +132,7 @@ def _project(
 ):
     n_gaussians = primitives.opacities.shape[0]
     for block in prange((n_gaussians + WIDTH - 1) // WIDTH):
-        _project_eight(rows_from(block * WIDTH, n_gaussians), primitives, pose, constants, extent, out)
+        _project_eight(eight_rows(block * WIDTH, n_gaussians), primitives, pose, constants, extent, out)
 
 
 def project(
@@ -151,7 +151,7 @@ def project(
     primitives = Primitives(*contiguous(means, quats, scales, opacities))
     alpha_min = dtype.type(conventions.alpha_min)
     extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
-    _project(primitives, pose_of(camera), constants_of(camera, conventions), extent, out)
+    _project(primitives, pack_pose(camera), pack_constants(camera, conventions), extent, out)
     return out
 
 
@@ -212,7 +212,7 @@ def _project_chunk_vjp(chunk, primitives, radii, pose, constants, v, out, v_pose
                 out.quats[n, i] = ZERO
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(radii, first, end, visible)
-    in_rows = Pose(rows_of(pose.R), pose.centre)  # read once
+    in_rows = Pose(matrix_rows(pose.R), pose.centre)  # read once
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
         is_counted = iota(DOUBLE) < count - i
@@ -231,7 +231,7 @@ def _project_vjp(
     v_poses = np.empty((N_CHUNKS, 12 * WIDTH), np.float64)
     for chunk in prange(N_CHUNKS):
         _project_chunk_vjp(chunk, primitives, radii, pose, constants, v, out, v_poses)
-    return total_of(v_poses)
+    return sum_parts(v_poses)
 
 
 def project_vjp(
@@ -256,8 +256,8 @@ def project_vjp(
     )
     primitives, pose, constants = (
         Primitives(*contiguous(means, quats, scales, opacities)),
-        pose_of(camera),
-        constants_of(camera, conventions),
+        pack_pose(camera),
+        pack_constants(camera, conventions),
     )
     v_pose = _project_vjp(primitives, projection.radii, pose, constants, v_projection, out).reshape(3, 4)
     out.cam_from_world_R[:] = v_pose[:, :3]

@@ -20,15 +20,15 @@ from minisplat_ref.cpu.compositing.tile_state import (
     N_ROWS,
     Tile,
     corner,
-    frame_of,
-    lists_of,
+    marked_rows,
     open_rows,
+    pack_frame,
+    pack_lists,
     row_in_image,
-    rows_of,
     start_tile,
     take_tiles,
 )
-from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.cpu.gaussian_rows import eight_rows
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, load, reduce_sum, store
 from minisplat_ref.jit.scheduling import make_shared_counter
@@ -50,9 +50,9 @@ def removal_changes(
     exp = choose_exponential(dtype)
     removal_kernel(exp, n_channels)(
         output.saved if output.saved is not None else records_of(projection, colors, conventions),
-        lists_of(bins),
+        pack_lists(bins),
         n_threads(),
-        frame_of(bins, conventions, dtype),
+        pack_frame(bins, conventions, dtype),
         output.image.reshape(output.alpha.size, n_channels),
         slots,
     )
@@ -76,7 +76,7 @@ def removal_kernel(exp: Callable, n_channels: int) -> Callable:
             x, y, n_pixels = row_in_image(row, x0, y0, frame)
             if n_pixels > 0:  # otherwise as start_tile left it
                 first = y * frame.width + x
-                rows = rows_from(first, first + n_pixels)
+                rows = eight_rows(first, first + n_pixels)
                 for k in range(n_channels):
                     store(state, row * row_size + behind_place + k * WIDTH, gather(image, rows, k))
 
@@ -95,7 +95,7 @@ def removal_kernel(exp: Callable, n_channels: int) -> Callable:
             n = ids[m]
             write_alphas(scratch, rows, records, n, x0, y0)
             total = broadcast(s.dtype.type(0))
-            for row in rows_of(rows):
+            for row in marked_rows(rows):
                 i = row * row_size
                 unclamped = load(scratch, ALPHAS + row * WIDTH)
                 after, weight = blend(load(s, i), unclamped, frame)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, contiguous, list_visible_of, load_rows, total_of, triple
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, contiguous, list_visible_degree, load_rows, sum_parts, triple
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -148,7 +148,7 @@ def _rest_vjp(k, v_red, v_green, v_blue, y, rest):
 
 
 @scalar
-def _triple_at(buffer, k):
+def _load_triple(buffer, k):
     return _at(buffer, k), _at(buffer, k + 1), _at(buffer, k + 2)
 
 
@@ -186,7 +186,7 @@ def _loop_over_chunk(has_gradient: bool) -> Callable:
         y = np.empty(N_BASES * WIDTH, means.dtype)
         rest = np.zeros(max(width, WIDTH) * WIDTH, means.dtype)  # beyond the active degree the gradient is zero
         visible = np.empty(end - first + WIDTH, np.int64)
-        count = list_visible_of(radii, degrees, degree, first, end, visible)
+        count = list_visible_degree(radii, degrees, degree, first, end, visible)
         n_rest = (degree + 1) * (degree + 1) - 1
         for i in range(0, count, WIDTH):
             rows = load_rows(visible, i)
@@ -234,11 +234,11 @@ def _loop_over_chunk(has_gradient: bool) -> Callable:
                         store(v_rest, visible[i + r] * width + k, v_rest.dtype.type(0))
             v_d = (ZERO * dx, ZERO * dx, ZERO * dx)
             if degree >= 1:
-                v_d = _add_lanes(v_d, basis_1_vjp(c, _triple_at(y, 0)))
+                v_d = _add_lanes(v_d, basis_1_vjp(c, _load_triple(y, 0)))
             if degree >= 2:
-                v_d = _add_lanes(v_d, basis_2_vjp(dx, dy, dz, c, (*_triple_at(y, 3), _at(y, 6), _at(y, 7))))
+                v_d = _add_lanes(v_d, basis_2_vjp(dx, dy, dz, c, (*_load_triple(y, 3), _at(y, 6), _at(y, 7))))
             if degree >= 3:
-                v_basis = (*_triple_at(y, 8), *_triple_at(y, 11), _at(y, 14))
+                v_basis = (*_load_triple(y, 8), *_load_triple(y, 11), _at(y, 14))
                 v_d = _add_lanes(v_d, basis_3_vjp(dx, dy, dz, c, v_basis))
             v_x, v_y, v_z = direction_vjp(dx, dy, dz, inverse, v_d[0], v_d[1], v_d[2])
             scatter(v_means, rows, 0, v_x)
@@ -304,7 +304,7 @@ def _sh_colors_vjp(
         _zero_culled(first, end, radii, v)
         for degree in range(harmonics.lowest, harmonics.highest + 1):
             _differentiate_chunk((first, end), degree, shaded, harmonics, radii, None, (v_colors, v, v_offsets[chunk]))
-    return total_of(v_offsets)
+    return sum_parts(v_offsets)
 
 
 def sh_colors_vjp(

@@ -50,7 +50,7 @@ class Pair(NamedTuple):
     """[H, W] True where a pixel counts; [1, 1] True where all do."""
 
 
-def window_of(dtype: np.dtype) -> Floats:
+def window_weights(dtype: np.dtype) -> Floats:
     """Return the weights [11] of the window."""
     offsets = np.arange(SSIM_WINDOW) - MARGIN
     weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
@@ -230,7 +230,7 @@ def photometric_loss(
         )
     )
     n_tiles = -(-height // TILE) * -(-width // TILE)
-    window = to_device(window_of(dtype))
+    window = to_device(window_weights(dtype))
     derivatives, sums = empty((N_DERIVATIVES, *image.shape), dtype), empty((n_tiles, 2), dtype)
     v_image = empty(image.shape, dtype)
     launch(similarity_kernel(dtype), n_tiles, BLOCK, pair, window, derivatives, sums)

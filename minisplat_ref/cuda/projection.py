@@ -8,7 +8,7 @@ in order, and the blocks' sums are added in order.
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.projection import constants_of, pose_of
+from minisplat_ref.cpu.projection import pack_constants, pack_pose
 from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host
 from minisplat_ref.cuda.target import ROW_THREADS, cuda, device_function, gpu_kernel, launch_rows, n_row_blocks
 from minisplat_ref.jit.literals import ZERO
@@ -21,9 +21,9 @@ from minisplat_ref.scalar.projection import (
     conic_vjp,
     dot,
     matmul3,
+    matrix_rows,
     project_gaussian,
     project_gaussian_vjp,
-    rows_of,
     to_camera,
     transpose3,
 )
@@ -64,7 +64,7 @@ def project_rows(
     n = cuda.grid(1)
     if n >= primitives.opacities.shape[0]:
         return
-    R = rows_of(pose.R)
+    R = matrix_rows(pose.R)
     x, y, z = wide_triple(primitives.means, n)
     p = to_camera(R, pose.centre, x, y, z)
     M = axes(wide_quaternion(primitives.quats, n), wide_triple(primitives.scales, n))
@@ -108,8 +108,8 @@ def project(
     )
     alpha_min = dtype.type(conventions.alpha_min)
     extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
-    primitives, pose = to_device(Primitives(means, quats, scales, opacities)), to_device(pose_of(camera))
-    launch_rows(project_rows, n, primitives, pose, constants_of(camera, conventions), extent, out)
+    primitives, pose = to_device(Primitives(means, quats, scales, opacities)), to_device(pack_pose(camera))
+    launch_rows(project_rows, n, primitives, pose, pack_constants(camera, conventions), extent, out)
     return beside(means, out)
 
 
@@ -157,7 +157,7 @@ def project_rows_vjp(
         out.quats[n, 3] = ZERO
         out.opacities[n] = ZERO
     elif n < n_rows:
-        R = rows_of(pose.R)
+        R = matrix_rows(pose.R)
         mean = wide_triple(primitives.means, n)
         p = to_camera(R, pose.centre, mean[0], mean[1], mean[2])
         quat, scale = wide_quaternion(primitives.quats, n), wide_triple(primitives.scales, n)
@@ -202,8 +202,8 @@ def project_vjp(
         n,
         to_device(Primitives(means, quats, scales, opacities)),
         to_device(projection.radii),
-        to_device(pose_of(camera)),
-        constants_of(camera, conventions),
+        to_device(pack_pose(camera)),
+        pack_constants(camera, conventions),
         to_device(v_projection),
         out,
         v_poses,

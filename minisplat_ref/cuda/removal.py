@@ -1,4 +1,4 @@
-"""How much the image would change without each Gaussian; see ``reference.removal``.
+"""The squared change of the image without each Gaussian; see ``reference.removal``.
 
 A block walks down its tile's list as the backward kernel does. Each thread keeps the light from behind the current hit
 by channels; squares are summed over each warp, the warps in order into the slot of the pair, and slots in order.
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import pack_frame
 from minisplat_ref.cuda.arrays import beside, empty, to_device, zeros
 from minisplat_ref.cuda.compositing.records import COLOR, records_of
-from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, lists_of, pixel_of, read_batch
+from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, pack_lists, read_batch, thread_pixel
 from minisplat_ref.cuda.target import (
     GpuKernel,
     cuda,
@@ -49,7 +49,7 @@ def removal_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
         exchange = cuda.shared.array((n_exchanged, 1), dtype)
         behind = cuda.local.array(n_colors, dtype)
         change = cuda.local.array(1, dtype)
-        x, y = pixel_of(frame)
+        x, y = thread_pixel(frame)
         is_pixel = x < frame.width and y < frame.height
         center_x, center_y = real(x) + HALF, real(y) + HALF
         T = real(1) if is_pixel else real(-1)
@@ -109,8 +109,8 @@ def removal_changes(
         len(bins.tile_offsets) - 1,
         BLOCK,
         records_of(projection, colors),
-        lists_of(bins),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins),
+        pack_frame(bins, conventions, dtype),
         to_device(output.image),
         slots,
     )

@@ -1,4 +1,4 @@
-"""What a training on the device needs besides the stages, so that no parameter leaves it: a thread for each Gaussian.
+"""Kernels of a training whose parameters stay on the device, besides the stages: a thread for each Gaussian.
 
 Activations and the chain rule through them, which rows a view sees, and whether a number is not finite.
 """
@@ -12,7 +12,7 @@ from minisplat_ref.cuda.adam import list_on_device
 from minisplat_ref.cuda.arrays import empty, to_device, to_host, zeros
 from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.scalar.activation import opacity_of, opacity_of_vjp, scale_of, scale_of_vjp
+from minisplat_ref.scalar.activation import activate_opacity, activate_opacity_vjp, activate_scale, activate_scale_vjp
 from minisplat_ref.types import Bools, Gaussians, Ints, PrimitiveGradient, Primitives, SHGradient
 
 __all__ = [
@@ -54,9 +54,9 @@ def activate_rows(
     if n >= opacities.shape[0]:
         return
     for k in range(3):
-        scales[n, k] = scale_of(log_scales[n, k], largest)
+        scales[n, k] = activate_scale(log_scales[n, k], largest)
     is_drawn = is_visible.shape[0] == 0 or is_visible[n] != 0
-    opacities[n] = opacity_of(opacity_logits[n]) if is_drawn else ZERO
+    opacities[n] = activate_opacity(opacity_logits[n]) if is_drawn else ZERO
 
 
 def activate(gaussians: Gaussians, is_visible: Bools | None) -> Primitives:
@@ -82,8 +82,8 @@ def chain_rows(
         return
     for k in range(3):
         v.means[n, k] += v_means[n, k]
-        v.scales[n, k] = scale_of_vjp(primitives.scales[n, k], v.scales[n, k])
-    v.opacities[n] = opacity_of_vjp(primitives.opacities[n], opacity_logits[n], v.opacities[n])
+        v.scales[n, k] = activate_scale_vjp(primitives.scales[n, k], v.scales[n, k])
+    v.opacities[n] = activate_opacity_vjp(primitives.opacities[n], opacity_logits[n], v.opacities[n])
 
 
 def chain(gaussians: Gaussians, primitives: Primitives, v: PrimitiveGradient, v_sh: SHGradient) -> Gaussians:

@@ -18,7 +18,7 @@ ONE_BLOCK = 32 * BLOCK_NUMBERS  # numbers up to which one block does it all, whi
 
 
 @device_function
-def sum_of(counts, first, end):
+def sum_range(counts, first, end):
     """Return the sum of some numbers."""
     total = np.int64(0)
     for i in range(first, end):
@@ -46,7 +46,7 @@ def sum_blocks(counts, sums):
     """Write the sum of the numbers of one block."""
     totals = cuda.shared.array(THREADS, np.int64)
     first = cuda.blockIdx.x * BLOCK_NUMBERS + cuda.threadIdx.x * NUMBERS
-    total = sum_of(counts, first, min(first + NUMBERS, counts.shape[0]))
+    total = sum_range(counts, first, min(first + NUMBERS, counts.shape[0]))
     before = scan_block(total, totals)
     if cuda.threadIdx.x == THREADS - 1:
         sums[cuda.blockIdx.x] = before + total
@@ -60,7 +60,7 @@ def scan_numbers(counts, starts, per_thread, offsets):
     start = starts[cuda.blockIdx.x] if cuda.blockIdx.x > 0 else np.int64(0)
     first = (cuda.blockIdx.x * THREADS + cuda.threadIdx.x) * per_thread
     end = min(first + per_thread, n)
-    total = start + scan_block(sum_of(counts, first, end), totals)
+    total = start + scan_block(sum_range(counts, first, end), totals)
     for i in range(first, end):
         offsets[i] = total
         total += counts[i]

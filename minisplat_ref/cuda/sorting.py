@@ -29,7 +29,7 @@ def write_order(order):
 
 
 @device_function
-def digit_of(keys, i, shift):
+def extract_digit(keys, i, shift):
     """Return a digit of a key."""
     return (keys[i] >> shift) & (N_DIGITS - 1)
 
@@ -43,7 +43,7 @@ def count_own(keys, shift, counts):
     for digit in range(N_DIGITS):
         counts[digit, thread] = 0
     for i in range(first, end):
-        counts[digit_of(keys, i, shift), thread] += 1
+        counts[extract_digit(keys, i, shift), thread] += 1
     cuda.syncthreads()
     return first, end
 
@@ -75,13 +75,13 @@ def move_keys(keys, values, shift, starts, sorted_keys, sorted_values):
             place += count
     cuda.syncthreads()
     for i in range(first, end):
-        own = digit_of(keys, i, shift)
+        own = extract_digit(keys, i, shift)
         place = places[own, cuda.threadIdx.x]
         sorted_keys[place], sorted_values[place] = keys[i], values[i]
         places[own, cuda.threadIdx.x] = place + 1
 
 
-def order_of(n: int) -> Any:
+def initial_order(n: int) -> Any:
     """Return the numbers from 0 to ``n`` - 1, int32 on the device."""
     order = empty(n, np.int32)
     launch_rows(write_order, n, order)

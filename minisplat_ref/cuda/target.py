@@ -235,6 +235,6 @@ else:
             return lambda a: libdevice.ceilf(a)
         return lambda a: libdevice.ceil(a)
 
-    @overload(lanes.exp_of, target="cuda")
-    def _exp_of(a):
+    @overload(lanes.libm_exp, target="cuda")
+    def _libm_exp(a):
         return lambda a: math.exp(a)

@@ -13,7 +13,7 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cuda.arrays import empty, is_on_device, to_device, to_host
 from minisplat_ref.cuda.scanning import exclusive_sums
-from minisplat_ref.cuda.sorting import order_of, sort_by_key
+from minisplat_ref.cuda.sorting import initial_order, sort_by_key
 from minisplat_ref.cuda.target import check_room, cuda, device_function, gpu_kernel, launch_rows
 from minisplat_ref.memory import BYTES_PER_PAIR
 from minisplat_ref.types import Projection, TileBins, TileGrid
@@ -104,7 +104,7 @@ def order_by_depth(depths: Any) -> Any:
     dtype = np.int32 if n_bits == 32 else np.int64
     keys = empty(len(depths), dtype)
     launch_rows(write_keys, len(depths), to_device(depths.view(dtype)), dtype(np.iinfo(dtype).min), keys)
-    return sort_by_key(keys, order_of(len(depths)), n_bits)[1]
+    return sort_by_key(keys, initial_order(len(depths)), n_bits)[1]
 
 
 @gpu_kernel

@@ -134,7 +134,7 @@ def find(name: str) -> DataSet:
     return CATALOGUE[name]
 
 
-def files_of(name: str) -> list[File]:
+def scene_files(name: str) -> list[File]:
     """Return the files of a set, its licence first."""
     data_set = find(name)
     listed = (files(__package__) / "catalogue.sha256").read_text(encoding="utf-8")

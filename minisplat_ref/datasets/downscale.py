@@ -1,4 +1,4 @@
-"""Write the images of a scene, smaller by a factor D, into the folder ``images_D`` beside them.
+"""Write the images of a scene, smaller by a factor D, into the folder ``images_D`` next to them.
 
 Loading a scene with ``downscale=D`` uses that folder, and resizes on the fly without it: this only saves time. Sizes
 are rounded; colours pass through the same LANCZOS filter as on the fly.

@@ -1,4 +1,4 @@
-"""Find the photographs in a folder, and leave out files that programs have put beside them.
+"""Find the photographs in a folder, and leave out files that programs have put next to them.
 
 Cameras, phones and file managers leave previews and hidden copies (``._0001.jpg`` of macOS, ``@eaDir`` of a network
 disk, ``.thumbnails``). A scene has masks and smaller copies (``masks/``, ``images_2/``). They end like photographs, but
@@ -19,7 +19,7 @@ UNREAD_SUFFIXES = (
 )
 """Formats of cameras that are not read."""
 MASKS = "masks"
-"""Folder of masks beside the photographs."""
+"""Folder of masks next to the photographs."""
 SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
 NAMED_MAX = 20  # files that a message names
 

@@ -1,7 +1,7 @@
 """The arguments of gsplat's call, checked and packed: some are computed, some make no difference, others are refused.
 
 gsplat's ``rasterization`` has forty keywords. Those that are not computed are refused by name unless they have their
-default: a call must not return another result than gsplat's in silence. ``docs/ORACLE.md`` has the table.
+default: a call must not silently return another result than gsplat's. ``docs/ORACLE.md`` has the table.
 """
 
 from collections.abc import Callable, Mapping
@@ -76,7 +76,7 @@ class Batch(NamedTuple):
 class Refused(NamedTuple):
     """A keyword that is not computed."""
 
-    asks: Callable[[Any], bool]
+    is_requested: Callable[[Any], bool]
     """Whether a value requests it, rather than being gsplat's default."""
     way_out: str
 
@@ -147,7 +147,7 @@ def check_refused(function: str, given: Mapping[str, Any]) -> None:
             continue
         if name not in REFUSED:
             raise TypeError(f"{function}() got an unexpected keyword argument {name!r}")
-        if REFUSED[name].asks(value):
+        if REFUSED[name].is_requested(value):
             shown = f"={value!r}" if isinstance(value, bool | str | int) else ""
             raise InputError(f"{name}{shown} is not computed; {REFUSED[name].way_out}")
 

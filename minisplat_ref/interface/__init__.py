@@ -1,4 +1,4 @@
-"""The user interface that all wings share: arguments, progress, tables and pictures, without any formula.
+"""The user interface that all wings share: arguments, progress, tables and images, without any formula.
 
 ================== ==================================================================
 :mod:`.arguments`  the types of arguments, their errors and their help

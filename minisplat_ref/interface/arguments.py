@@ -169,7 +169,7 @@ def add_worker_arguments(
     group.add_argument("--cluster", type=name, default=None, metavar="ADDRESS", help=elsewhere)
 
 
-def without_workers(words: Sequence[str]) -> list[str]:
+def drop_workers(words: Sequence[str]) -> list[str]:
     """Return the words of a command without ``--workers N`` and ``--cluster ADDRESS``."""
     options = ("--workers", "--cluster")
     pairs = zip(("", *words), words, strict=False)

@@ -1,4 +1,4 @@
-"""Write a file or folder completely or not at all: write a temporary one beside it, then rename it.
+"""Write a file or folder completely or not at all: write a temporary one next to it, then rename it.
 
 A process that is killed leaves its unfinished part behind, under a name that :func:`remove_parts` recognises.
 """

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.images import MASK_THRESHOLD, has_transparency, open_image, pixels_of, read_mask, white_of
+from minisplat_ref.io.images import MASK_THRESHOLD, decode_pixels, has_transparency, open_image, read_mask, white_level
 from minisplat_ref.io.stored_views import StoredView
 from minisplat_ref.types import View
 
@@ -96,10 +96,10 @@ def _reason(view: View, files: MaskFiles) -> str:
 
 
 def describe_levels(path: Path) -> str:
-    """Say which values a mask file holds, and from which on a pixel counts."""
+    """Describe the values of a mask file, and the level from which a pixel counts."""
     with open_image(path) as image:
-        white = white_of(image)
-        levels = np.asarray(image) if white != 255.0 else pixels_of(image)  # [H, W] or [H, W, 3 or 4]
+        white = white_level(image)
+        levels = np.asarray(image) if white != 255.0 else decode_pixels(image)  # [H, W] or [H, W, 3 or 4]
     if levels.ndim == 3 and levels[..., 3:].size and (alpha := levels[..., 3].max()) < MASK_THRESHOLD:
         return f"its alpha goes up to {alpha}, from {MASK_THRESHOLD} on a pixel is opaque"
     colors = levels[..., :3] if levels.ndim == 3 else levels

@@ -79,7 +79,7 @@ def _frame(center: Floats, size: float, size_min: float) -> Frame:
 
 
 def describe_frame(frame: Frame) -> str:
-    """Return in half a sentence where a frame is."""
+    """Describe the place of a frame in half a sentence."""
     x, y, z = frame.origin
     moved = f"moved by ({-x:.10g}, {-y:.10g}, {-z:.10g})" if any(frame.origin) else ""
     scaled = f"scaled by {1.0 / frame.unit:g}" if frame.unit != 1.0 else ""

@@ -36,7 +36,7 @@ HEIF_SUFFIXES = (".heic", ".heif")
 """Photographs of telephones, which pillow-heif reads, the extra ``heic``."""
 
 BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)
-"""Names of hidden files and folders, and of those that programs put beside photographs."""
+"""Names of hidden files and folders, and of those that programs put next to photographs."""
 
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"quality": 95}}
 SOURCE = "minisplat_ref source"  # key of an opened image's path among its data, for messages on its values
@@ -144,7 +144,7 @@ def has_transparency(path: str | Path) -> bool:
         return image.has_transparency_data
 
 
-def white_of(image: Image.Image) -> float:
+def white_level(image: Image.Image) -> float:
     """Return the value that is white in an open image file.
 
     Raises
@@ -185,12 +185,12 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         If the file is missing, is not an image, is truncated, or has no defined value of white.
     """
     with open_image(Path(path)) as image:
-        return pixels_of(image)
+        return decode_pixels(image)
 
 
-def pixels_of(image: Image.Image) -> NDArray[np.uint8]:
+def decode_pixels(image: Image.Image) -> NDArray[np.uint8]:
     """Return the pixels of an opened image as :func:`read_image` does, [H, W, 3] or [H, W, 4]."""
-    white = white_of(image)
+    white = white_level(image)
     if white != 255.0:  # gray; Pillow itself keeps the upper byte of 16-bit colour files
         levels = np.asarray(image)  # [H, W]
         gray = _floats_as_bytes(_source(image), levels) if white == 1.0 else (levels >> 8).clip(0, 255).astype(np.uint8)

@@ -110,13 +110,13 @@ def warn_of_another(path: Path, label: Label, extension: str, why: str) -> None:
         warnings.warn(one_line(message), InputWarning, stacklevel=3)
 
 
-def sidecar_of(path: Path) -> Path:
+def sidecar_path(path: Path) -> Path:
     """Return the path of the label of a file that has no place for it."""
     return path.with_name(f"{path.name}.json")
 
 
 def read_sidecar(path: Path, content: bytes) -> Label:
-    """Return the label beside a file; a JSON file of another program is none.
+    """Return the label stored next to a file; a JSON file of another program is none.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def read_sidecar(path: Path, content: bytes) -> Label:
     InputError
         The sidecar cannot be read or is damaged.
     """
-    sidecar = sidecar_of(path)
+    sidecar = sidecar_path(path)
     if not sidecar.is_file():
         return NO_LABEL
     ours = _ours(read_json(sidecar, f"mend or remove it, it says how {path.name} is drawn"))
@@ -152,7 +152,7 @@ def write_sidecar(path: Path, content: bytes, label: Label) -> None:
     InputError
         Another program's file has the sidecar's name, or it cannot be written.
     """
-    sidecar = sidecar_of(path)
+    sidecar = sidecar_path(path)
     is_ours = sidecar.is_file() and _is_ours(sidecar)
     if label == NO_LABEL:
         if is_ours:

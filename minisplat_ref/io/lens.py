@@ -1,7 +1,7 @@
 """Lens distortion: most renderers have only pinhole cameras, so pycolmap warps other photographs to a pinhole.
 
 COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels. For renderers that
-support the lens, :func:`optics_of` describes it as :class:`minisplat_ref.types.Optics`.
+support the lens, :func:`lens_optics` describes it as :class:`minisplat_ref.types.Optics`.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ COEFFICIENTS: Mapping[str, tuple[str, int, tuple[int, ...]]] = {
 N_COEFFICIENTS = {BROWN: 8, FISHEYE: 4, "orthographic": 0}
 
 
-def optics_of(lens: Lens, path: Path) -> Optics:
+def lens_optics(lens: Lens, path: Path) -> Optics:
     """Return the optics of a lens of COLMAP; ``path`` is the photograph's, for the message.
 
     Raises
@@ -88,7 +88,7 @@ def import_quiet_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def pinhole_of(camera: Camera, lens: Lens) -> Camera:
+def undistorted_pinhole(camera: Camera, lens: Lens) -> Camera:
     """Return the pinhole camera that :func:`undistort` gives, which does not depend on the photograph."""
     pycolmap = import_pycolmap()
     distorted = pycolmap.Camera(model=lens.model, width=camera.width, height=camera.height, params=lens.params)

@@ -60,7 +60,7 @@ def name_inside(name: str, source: str | Path) -> str:
     return name
 
 
-def path_beside(file: Path, name: str) -> Path:
+def nearby_path(file: Path, name: str) -> Path:
     """Return the path that a file gives relative to itself, if it stays in the file's folder or a folder next to it.
 
     Parameters

@@ -171,14 +171,14 @@ def _path_of_means(means: Floats, width: int, height: int) -> _Path:
 
 
 def _look_along(forward: Floats, up: Floats) -> Floats:
-    """Rotation cam_from_world [3, 3] whose rows are the camera's right, down and forward."""
+    """Return the rotation cam_from_world [3, 3], whose rows are the camera's right, down and forward."""
     forward = _unit(forward, fallback=_perpendicular(up))
     right = _unit(np.cross(forward, up), fallback=_perpendicular(up))
     return np.stack([right, np.cross(forward, right), forward])
 
 
 def _perpendicular(direction: Floats) -> Floats:
-    """Some unit vector at a right angle to a direction: across it and the axis that it leans on least."""
+    """Return a unit vector at a right angle to a direction."""
     return _unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]), fallback=np.array([1.0, 0.0, 0.0]))
 
 

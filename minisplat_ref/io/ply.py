@@ -21,7 +21,7 @@ from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.label import NO_LABEL, Label, from_comments, to_comments
 from minisplat_ref.io.ply_dialects import as_usual, renamed
-from minisplat_ref.io.ply_file import comments_of, n_rows_of, property_names, read_vertices, write_vertices
+from minisplat_ref.io.ply_file import comments_of, count_rows, property_names, read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
 
@@ -315,7 +315,7 @@ def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
     """Return advice for a PLY that does not contain Gaussians."""
     if "packed_position" in columns:
         return "it is SuperSplat's: let its name end in .compressed.ply"
-    n_faces = n_rows_of(path, "face")
+    n_faces = count_rows(path, "face")
     if n_faces:
         return f"it is a mesh of {n_faces:,} faces, which is not rendered: give a trained point_cloud.ply"
     if "opacity" in columns or any(name in columns for name in (*SCALES, *QUATS)):

@@ -88,7 +88,7 @@ class Header(NamedTuple):
         return self.elements[len(self.before)]
 
 
-def n_rows_of(path: str | Path, name: str) -> int:
+def count_rows(path: str | Path, name: str) -> int:
     """Return the total number of rows of the elements of a name, such as ``face``; 0 if there are none.
 
     Raises

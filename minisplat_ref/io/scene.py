@@ -32,7 +32,7 @@ from minisplat_ref.io.images import (
     resize_image,
     resize_mask,
 )
-from minisplat_ref.io.lens import Lens, optics_of, pinhole_of, undistort
+from minisplat_ref.io.lens import Lens, lens_optics, undistort, undistorted_pinhole
 from minisplat_ref.io.names import is_file
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
@@ -313,9 +313,9 @@ def _camera(photo: Photo, reading: Reading) -> Camera:
     if (width, height) != (camera.width, camera.height):
         raise InputError(_wrong_size(photo, path, width, height))
     if photo.lens is not None and reading.as_photographed:
-        camera = camera._replace(optics=optics_of(photo.lens, path))
+        camera = camera._replace(optics=lens_optics(photo.lens, path))
     elif photo.lens is not None:
-        camera = pinhole_of(camera, photo.lens)
+        camera = undistorted_pinhole(camera, photo.lens)
     return rescale_camera(camera, *downscaled_size(camera.width, camera.height, reading.downscale))
 
 
@@ -351,7 +351,7 @@ def _signature(photo: Photo, reading: Reading) -> list[tuple[int, int] | None]:
 def half_size(view: View) -> View:
     """Return the view at half the width and height, rounded, with matching intrinsics.
 
-    Of a mask so fine that no pixel would be left, the pixels stay of which most is white.
+    If a mask is so fine that no pixel would be left, the pixels that are mostly white stay.
     """
     width, height = downscaled_size(view.camera.width, view.camera.height, 2)
     camera = rescale_camera(view.camera, width, height)

@@ -26,7 +26,7 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.images import IMAGE_SUFFIXES, PIXELS_MAX, image_size
 from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
-from minisplat_ref.io.names import is_file, path_beside, spelled_on_disk
+from minisplat_ref.io.names import is_file, nearby_path, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, load_points
 from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing, split_photos
 from minisplat_ref.types import Camera, Floats, Scene
@@ -151,7 +151,7 @@ def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
 
 def _image_file(file: Path, file_path: str) -> Path | None:
     """Return a frame's image, relative to the JSON file; try suffixes if it has none. None if missing."""
-    path = path_beside(file, file_path)
+    path = nearby_path(file, file_path)
     names = (path.name, *(path.name + suffix for suffix in IMAGE_SUFFIXES))
     candidates = (path.parent / spelled_on_disk(path.parent, name) for name in names)
     return next((candidate for candidate in candidates if is_file(candidate)), None)
@@ -161,7 +161,7 @@ def _named_file(file: Path, entries: Mapping[str, Any], key: str) -> Path:
     """Return the path that an entry gives."""
     if not isinstance(entries[key], str):
         raise InputError(f"{file}: {key} is {reprlib.repr(entries[key])}, not the path of a file; repair or remove it")
-    path = path_beside(file, entries[key])
+    path = nearby_path(file, entries[key])
     return path.parent / spelled_on_disk(path.parent, path.name)
 
 

@@ -47,12 +47,12 @@ def sqrt(a: Any) -> Any:
     return np.sqrt(a)
 
 
-def exp_of(a: Any) -> Any:
+def libm_exp(a: Any) -> Any:
     """Return libm's exp of every lane."""
     return np.exp(a)
 
 
-def log_of(a: Any) -> Any:
+def libm_log(a: Any) -> Any:
     """Return libm's natural logarithm of every lane."""
     return np.log(a)
 
@@ -151,7 +151,7 @@ def lowest_bit(bits: Any) -> int:
     return (int(bits) & -int(bits)).bit_length() - 1
 
 
-def bits_between(bounds: Any) -> Any:
+def range_mask(bounds: Any) -> Any:
     """Return an integer of 64 bits; in its quarter ``k`` the bits [``bounds[k]``, ``bounds[4 + k]``) are set.
 
     Bounds are integers up to 16, in lanes. A start is not negative; an end that is not above its start sets no bits.

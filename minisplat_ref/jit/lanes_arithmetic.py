@@ -18,10 +18,10 @@ from numba.extending import models, overload, register_model
 from minisplat_ref.jit.lanes import (
     WIDTH,
     ceil,
-    exp_of,
     floor,
     ldexp,
-    log_of,
+    libm_exp,
+    libm_log,
     maximum,
     minimum,
     rint,
@@ -166,8 +166,8 @@ _register_unary(floor, lambda builder, a: _call(builder, "llvm.floor", a.type, [
 _register_unary(ceil, lambda builder, a: _call(builder, "llvm.ceil", a.type, [a]))
 _register_unary(rint, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
 _register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
-_register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
-_register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
+_register_unary(libm_exp, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
+_register_unary(libm_log, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
 
 
 @register_lowering(ldexp)

@@ -10,7 +10,6 @@ from numba.core import cgutils
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
-    bits_between,
     broadcast,
     cast,
     gather,
@@ -18,6 +17,7 @@ from minisplat_ref.jit.lanes import (
     load,
     lowest_bit,
     prefetch,
+    range_mask,
     reduce_any,
     reduce_max,
     reduce_sum,
@@ -250,8 +250,8 @@ def _lowest_bit(typing: Any, bits: Any) -> Any:
     return types.int64(bits), generate
 
 
-@register_lowering(bits_between)
-def _bits_between(typing: Any, bounds: Any) -> Any:
+@register_lowering(range_mask)
+def _range_mask(typing: Any, bounds: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         half = WIDTH // 2
         numbers = builder.fptosi(args[0], ir.VectorType(I32, WIDTH))

@@ -25,7 +25,7 @@ from minisplat_ref.reference.compositing import (
     empty_output,
     light_gradient,
 )
-from minisplat_ref.reference.hits import Response, TileHits, goes_on, tile_hits, transmit
+from minisplat_ref.reference.hits import Response, TileHits, is_accepted, tile_hits, transmit
 from minisplat_ref.reference.removal import hit_colors
 from minisplat_ref.types import BlendGradient, Bools, Floats, Ints, RenderOutput, TileBins
 
@@ -105,7 +105,7 @@ def sort_hits(primitives: Any, bins: TileBins, conventions: Conventions, by: Sor
     for tile in tile_hits(primitives, bins, unstopped, by.response):
         order = blending_order(tile.alphas > 0, tile.hit.depths, by.buffer_size)
         in_order = sort_by(order, tile.alphas)
-        in_order = np.where(goes_on(transmit(in_order)[1:], conventions), in_order, 0)
+        in_order = np.where(is_accepted(transmit(in_order)[1:], conventions), in_order, 0)
         T = transmit(in_order)  # [G + 1, P]
         T_of_rows = np.concatenate([undo_sort_by(order, T[:-1]), T[-1:]])
         yield SortedHits(tile._replace(alphas=undo_sort_by(order, in_order), transmittances=T_of_rows), order)
@@ -179,7 +179,7 @@ def composite_hits_vjp(
         weights = alphas * T
         v_c, v_dot_c, v_place = light_gradient(tile, weights, colors, response.response.shading, v)
         v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
-        behind = undo_sort_by(order, _sum_behind(sort_by(order, weights * v_dot_c))) + T_end * v_T_end
+        behind = undo_sort_by(order, _suffix_sums(sort_by(order, weights * v_dot_c))) + T_end * v_T_end
         v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
         v_tile = TileGradient(v_alphas, v_c, v_place, T_end @ v)
         add_tile_gradient(sums, response.response, primitives, tile, conventions, v_tile)
@@ -216,7 +216,7 @@ def removal_changes_of_hits(
     return changes
 
 
-def _sum_behind(terms: Floats) -> Floats:
+def _suffix_sums(terms: Floats) -> Floats:
     """Return for each row the sum [G, P] of the rows after it."""
     sums = np.cumsum(terms[::-1], axis=0)[::-1]  # [G, P] including the row itself
     return np.concatenate([sums[1:], np.zeros_like(terms[:1])])

@@ -22,7 +22,7 @@ from minisplat_ref.strategy import blur_split, clone_split, depth_reinit, import
 from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.depth_reinit import PixelPoints, reinitial_points
 from minisplat_ref.strategy.importance import ImportanceStats, collect_importance
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from minisplat_ref.strategy.ops import Edit, keep, n_rows
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.rates import LogLinear, Rewind
@@ -135,7 +135,7 @@ def reinitialise_from_depth(
         backdrop_distance=None if backdrop_extents is None else backdrop_extents * iteration.scene.extent,
         rng=state.rng,
     )
-    gaussians = from_points(points, colors, sh_degree=0)
+    gaussians = gaussians_from_points(points, colors, sh_degree=0)
     start_again(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
 
 

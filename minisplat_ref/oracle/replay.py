@@ -11,7 +11,7 @@ import numpy as np
 
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.rendering.backends import BACKENDS, REFERENCE, Backend
-from minisplat_ref.training.adam import fields_of
+from minisplat_ref.training.adam import named_fields
 from minisplat_ref.training.case import Case as View
 from minisplat_ref.training.guard import Examination, examine
 from minisplat_ref.types import Floats, Model
@@ -62,8 +62,8 @@ def _by(case: View, backend: Backend, dtype: type[np.floating]) -> View:
 
 
 def _gradient_error(found: Examination, truth: Examination) -> dict[str, Figure]:
-    expected = fields_of(truth.gradient.gaussians)
-    errors = {name: _error(v, expected[name]) for name, v in fields_of(found.gradient.gaussians).items()}
+    expected = named_fields(truth.gradient.gaussians)
+    errors = {name: _error(v, expected[name]) for name, v in named_fields(found.gradient.gaussians).items()}
     worst = max(errors, key=lambda name: (np.isnan(errors[name]), errors[name]))
     return {"gradient error": errors[worst], "of": worst}
 

@@ -1,4 +1,4 @@
-"""Stage 2b: what the low-pass does to a projected covariance, and how to undo its brightening.
+"""Stage 2b: the low-pass of a projected covariance, and the opacity factor that undoes its brightening.
 
 The 3DGS code adds ``eps I`` to every projected covariance C, so that no Gaussian is thinner than about a pixel; this is
 EWA splatting's prefilter. At unchanged opacity the wider Gaussian would add more light; Mip-Splatting's factor restores

@@ -1,6 +1,6 @@
-"""Statistics of blending: how much each primitive contributes, which dominates a pixel, and the median depth.
+"""Statistics of blending: the contribution of each primitive, the dominant one of a pixel, and the median depth.
 
-Mini-Splatting and Mini-Splatting2 choose by them which Gaussians are split and which stay.
+Mini-Splatting and Mini-Splatting2 choose by them the Gaussians that are split and those that stay.
 """
 
 import numpy as np

@@ -14,7 +14,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.reference.blend_stats import add_tile_stats, empty_stats, median_depths
-from minisplat_ref.reference.hits import CONIC, Response, Shading, TileHits, goes_on, tile_hits
+from minisplat_ref.reference.hits import CONIC, Response, Shading, TileHits, is_accepted, tile_hits
 from minisplat_ref.types import (
     BlendGradient,
     CompositeGradient,
@@ -78,7 +78,7 @@ def blend_tile_vjp(
     v_image: Floats,
     v_alpha: Floats,
 ) -> TileGradient:
-    """Gradient of :func:`blend_tile` with respect to what it blends.
+    """Gradient of :func:`blend_tile` with respect to its inputs.
 
     For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative with respect to ``T_end`` is
     ``v . background - v_alpha``. A hit contributes ``alpha_g T_g c_g`` and multiplies everything behind it by
@@ -102,7 +102,7 @@ def blend_tile_vjp(
     weights = alphas * T  # [G, P]
     v_c, v_dot_c, v_place = light_gradient(tile, weights, colors, shading, v_image)
     v_T_end = v_image @ background - v_alpha  # [P]
-    behind = _sum_behind(weights * v_dot_c) + T_end * v_T_end  # [G, P]
+    behind = _suffix_sums(weights * v_dot_c) + T_end * v_T_end  # [G, P]
     v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
     return TileGradient(v_alphas, v_c, v_place, T_end @ v_image)
 
@@ -165,7 +165,7 @@ def composite_hits(
     Returns
     -------
     RenderOutput
-        Image [H, W, D] and alpha [H, W], and what was asked for.
+        Image [H, W, D] and alpha [H, W], and the requested results.
     """
     output = empty_output(colors, background, bins, with_stats, with_median_depth)
     for tile in tile_hits(primitives, bins, conventions, response):
@@ -189,7 +189,7 @@ def composite_hits_vjp(
     output: RenderOutput,
     v_output: tuple[Floats, Floats],
 ) -> BlendGradient:
-    """Gradient of :func:`composite_hits` with respect to what it blends.
+    """Gradient of :func:`composite_hits` with respect to its inputs.
 
     It is that of :func:`blend_tile`, summed over the tiles: ``v_c_g = sum over pixels of w_g v``. The skip, the stop
     and the order are treated as fixed: the image jumps there and has no derivative.
@@ -253,7 +253,7 @@ def composite(
     Returns
     -------
     RenderOutput
-        Image [H, W, D] and alpha [H, W], and what was asked for.
+        Image [H, W, D] and alpha [H, W], and the requested results.
     """
     return composite_hits(
         CONIC,
@@ -340,7 +340,7 @@ def composite_all_pairs(
         alpha = np.minimum(conventions.alpha_max, projection.opacities[g] * np.exp(-np.maximum(sigma, 0)))
         is_hit = (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1)
         is_hit &= (sigma >= 0) & (alpha >= conventions.alpha_min)
-        is_open &= ~(is_hit & ~goes_on(T * (1 - alpha), conventions))
+        is_open &= ~(is_hit & ~is_accepted(T * (1 - alpha), conventions))
         alpha = np.where(is_hit & is_open, alpha, 0)
         image += (T * alpha)[:, :, None] * colors[g]
         T = T * (1 - alpha)
@@ -350,7 +350,7 @@ def composite_all_pairs(
 def empty_output(
     colors: Floats, background: Floats, bins: TileBins, with_stats: bool, with_median_depth: bool
 ) -> RenderOutput:
-    """Return arrays for the image, alpha and what is asked for, to be filled tile by tile.
+    """Return arrays for the image, alpha and the requested results, which are filled tile by tile.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ def add_tile_gradient(
     sums.background[:] += v.background
 
 
-def _sum_behind(terms: Floats) -> Floats:
+def _suffix_sums(terms: Floats) -> Floats:
     """Return for each row the sum [G, P] of the rows after it."""
     sums = np.cumsum(terms[::-1], axis=0)[::-1]  # [G, P] including the row itself
     return np.concatenate([sums[1:], np.zeros_like(terms[:1])])

@@ -1,8 +1,8 @@
-"""Stage 6: the depth of what a pixel shows: the mean over its hits, or where its ray meets the dominant Gaussian.
+"""Stage 6: the depth of a pixel: the mean over its hits, or the point where its ray meets the dominant Gaussian.
 
 The blended depth divided by the accumulated opacity is the mean depth of the hits. Where a ray passes through several
-surfaces, this mean lies on none of them. Mini-Splatting appendix D asks for one surface instead: along the ray
-``x(t) = o + t d`` a Gaussian is densest where ``(x - mu)^T Sigma^-1 (x - mu)`` is least::
+surfaces, this mean lies on none of them. Mini-Splatting appendix D takes one surface instead. Along the ray ``x(t) = o
++ t d`` a Gaussian is densest where ``(x - mu)^T Sigma^-1 (x - mu)`` is smallest::
 
     t = (mu - o)^T Sigma^-1 d / (d^T Sigma^-1 d)
 

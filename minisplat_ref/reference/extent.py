@@ -1,4 +1,4 @@
-"""Stage 2c: how far a projected Gaussian reaches, as a box of pixels. Nothing here has a gradient.
+"""Stage 2c: the extent of a projected Gaussian, as a box of pixels. Nothing here has a gradient.
 
 The conventions choose one of two rules. Full support (gsplat, Mini-Splatting2): the box holds every pixel whose alpha
 reaches ``alpha_min``, solved from ``opacity exp(-r^2 / 2) = alpha_min``. INRIA's (the 3DGS code): all 16-pixel tiles

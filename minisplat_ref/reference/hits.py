@@ -1,13 +1,12 @@
-"""Stage 5a: which primitives hit which pixels of a tile, how strongly, and the transmittance in front of each hit.
+"""Stage 5a: the hits of primitives on the pixels of a tile, their alphas, and the transmittance in front of each.
 
 These are 3DGS equations (3) and (4), the volume rendering of Max (1995) with one sample per Gaussian::
 
     alpha_g = min(alpha_max, o_g exp(-d^T Q_g d / 2)),   d = p_g - pixel centre
     T_g = prod_{j before g} (1 - alpha_j)
 
-Here a Gaussian is a flat ellipse, and its 3D shape plays no part. What any primitive does to a pixel is a
-:class:`Response`; that of 3DGS is ``CONIC``. Rays against 3D Gaussians, surfels, masks and pixel integrals are other
-responses.
+Here a Gaussian is a flat ellipse, and its 3D shape plays no part. A :class:`Response` is the effect of a primitive on a
+pixel; that of 3DGS is ``CONIC``. Rays against 3D Gaussians, surfels, masks and pixel integrals are other responses.
 
 A tile is one array with hits along the rows and pixels along the columns. Hits are taken in the order of the tile's
 list, which is that of the means' depths. A skipped hit has ``alpha_g = 0``, which changes no product and no sum.
@@ -23,7 +22,7 @@ from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
 
 class Hit(NamedTuple):
-    """What G primitives do to P pixels."""
+    """The hits of G primitives on P pixels."""
 
     unclamped: Floats  # [G, P] alpha before the clamp
     depths: Floats  # [G, P] along the ray
@@ -31,7 +30,7 @@ class Hit(NamedTuple):
 
 
 class ConicPlace(NamedTuple):
-    """Where pixels lie in a projected Gaussian."""
+    """The positions of pixels in a projected Gaussian."""
 
     offsets: Floats  # [G, P, 2] Gaussian's centre minus pixel's centre, px
     falloffs: Floats  # [G, P] E = exp(-sigma)
@@ -118,7 +117,7 @@ class Shading(NamedTuple):
 
 
 class Response(NamedTuple):
-    """What a primitive does to a pixel. ``primitives`` are any bundle that the functions understand."""
+    """The effect of a primitive on a pixel. ``primitives`` may be any bundle that the functions take."""
 
     boxes: Callable[[Any], Ints]
     """[N, 4] half-open pixels x0, y0, x1, y1: nothing is hit elsewhere."""
@@ -189,7 +188,7 @@ def tile_hits(
         alphas = np.where(is_hit, alphas, 0)
 
         # T never rises: once a hit would take it below the threshold, that hit and all behind it are left out.
-        alphas = np.where(goes_on(transmit(alphas)[1:], conventions), alphas, 0)
+        alphas = np.where(is_accepted(transmit(alphas)[1:], conventions), alphas, 0)
         is_clamped = hit.unclamped > conventions.alpha_max
         yield TileHits(ids, ys, xs, hit, is_clamped, alphas, transmit(alphas))
 
@@ -200,7 +199,7 @@ def transmit(alphas: Floats) -> Floats:
     return np.cumprod(np.concatenate([ones, 1 - alphas]), axis=0)
 
 
-def goes_on(transmittances: Floats, conventions: Conventions) -> Bools:
+def is_accepted(transmittances: Floats, conventions: Conventions) -> Bools:
     """Return whether a pixel takes a hit that would leave it with ``transmittances``; ``conventions`` set the bound."""
     if conventions.stops_at_equality:
         return transmittances > conventions.transmittance_min

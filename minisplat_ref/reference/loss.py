@@ -1,4 +1,4 @@
-"""Stage 7: how far a rendered image is from a photograph.
+"""Stage 7: the difference between a rendered image and a photograph.
 
 This is 3DGS equation (7), ``(1 - w) L1 + w (1 - SSIM)``, with the structural similarity of Wang et al. (2004): a
 Gaussian window of 11 pixels, here with zeros beyond the border as in the 3DGS code. Left out: the halving of D-SSIM in
@@ -14,7 +14,7 @@ from minisplat_ref.types import Bools, Floats, Ints
 
 
 class LossTape(NamedTuple):
-    """What the gradient of the loss needs."""
+    """Record of :func:`photometric_loss`, for its gradient."""
 
     image: Floats
     """[H, W, 3] rendered image, the target's values where the mask is False."""

@@ -56,7 +56,7 @@ def pinhole_vjp(means_cam: Floats, camera: Camera, v_means2d: Floats) -> Floats:
 
 
 def project_into_image(points: Floats, camera: Camera) -> tuple[Ints, Floats, Floats]:
-    """Return which points a camera sees in its image, and where.
+    """Return the rows, image positions and depths of the points inside a camera's image.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floa
     return np.stack(np.broadcast_arrays(*slopes, 1.0), axis=-1)
 
 
-def points_at(depth: Floats, camera: Camera) -> Floats:
+def unproject_depth(depth: Floats, camera: Camera) -> Floats:
     """Return the points that the pixels of a depth map show, ``x_world = R^T (z r - t)``, row by row.
 
     Parameters
@@ -215,14 +215,14 @@ def slope_limits(camera: Camera, conventions: Conventions, dtype: np.dtype) -> t
 
 
 def with_principal_point(camera: Camera, conventions: Conventions) -> Camera:
-    """Return the camera as the conventions see it: INRIA's rasteriser puts the axis through the image's centre."""
+    """Return the camera with the conventions' principal point; INRIA's is the image's centre."""
     if conventions.uses_principal_point:
         return camera
     return camera._replace(cx=0.5 * camera.width, cy=0.5 * camera.height)
 
 
 def _check_pinhole(camera: Camera) -> None:
-    """Refuse a camera whose optics the formulas here would leave out without a word.
+    """Refuse a camera whose optics the formulas here would silently ignore.
 
     Raises
     ------

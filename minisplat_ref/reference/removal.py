@@ -1,4 +1,4 @@
-"""How much the image would change without each Gaussian.
+"""The squared change of the image without each Gaussian.
 
 A pixel is linear in the alpha of each of its hits (3DGS equation (3)), so without hit g its colour C changes by exactly
 ``-q_g = -alpha_g dC/dalpha_g``. With the residual ``r = C - photograph``, the squared error changes by::
@@ -7,7 +7,7 @@ A pixel is linear in the alpha of each of its hits (3DGS equation (3)), so witho
 
 The second term is a gradient, that of the squared error with respect to the Gaussian's opacity, times the opacity. At a
 minimum it vanishes, and then the first is the whole increase: the saliency of optimal brain damage (LeCun et al. 1990).
-In mid-training the gradient is large, and says what the next steps will correct. So this stage returns the first term.
+In mid-training the gradient is large, and shows what the next steps will correct. So this stage returns the first term.
 
 It is exact for one Gaussian, unless the pixel stops before its last hit: without g it could take some more. It is not
 additive: of two Gaussians one behind the other, each alone may be superfluous.

@@ -1,4 +1,4 @@
-"""Stage 4: which Gaussians each tile of the image has to blend, and in which order.
+"""Stage 4: the lists of the Gaussians that each tile of the image has to blend, in their order.
 
 3DGS section 6 makes one key (tile, depth) for every tile that a Gaussian touches, and sorts once. The order is that of
 the depths of the means, the same for all pixels: an approximation that is exact only for Gaussians that do not overlap

@@ -34,7 +34,7 @@ from minisplat_ref.rendering import stages
 
 @dataclass(frozen=True)
 class Backend:
-    """One function per stage; :mod:`minisplat_ref.rendering.stages` says what each takes and returns.
+    """One function per stage; :mod:`minisplat_ref.rendering.stages` states what each takes and returns.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Backend:
     tile_width, tile_height : int
         Size of the tiles that the image is cut into, pixels.
     residence : module, optional
-        What a training needs besides to keep its arrays on a device; None where they are on the host.
+        Further functions for a training whose arrays stay on a device; None where they are on the host.
     """
 
     name: str
@@ -127,10 +127,10 @@ PLAIN = replace(
 """The same with the kernels that blend any primitive; slower, so it is not in ``BACKENDS``."""
 
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
-"""The backends that are there on every machine."""
+"""The backends that every machine has."""
 
 CUDA, CUDA_ATOMIC = "cuda", "cuda-atomic"
-"""The names of those that :func:`load_cuda` and :func:`load_cuda_atomic` load."""
+"""Names of the backends that :func:`load_cuda` and :func:`load_cuda_atomic` load."""
 
 
 @functools.cache

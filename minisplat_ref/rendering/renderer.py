@@ -4,9 +4,9 @@ Activations live here (3DGS section 5.1): ``scales = exp(log_scales)``, ``opacit
 out: checks for NaN, which belong where a file is read; a Gaussian whose footprint is not finite is culled.
 
 A :class:`Renderer` is the pair of functions that all code calls to render a model: training, evaluation, importance,
-depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another value; most wrap
-``SPLATTING``: they make Gaussians of what they have (moved to the view's time, decoded, chosen by level), draw these,
-and carry the gradient back.
+depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of rendering is another value; most
+wrap ``SPLATTING``: they make Gaussians from their parameters (moved to the view's time, decoded, chosen by level),
+render these, and carry the gradient back.
 """
 
 import math
@@ -56,7 +56,9 @@ class RenderGradient(NamedTuple):
     background: Floats  # [3]
     cam_from_world_R: Floats  # [3, 3] with respect to the nine entries, unconstrained
     cam_from_world_t: Floats  # [3]
-    means2d: Floats  # [N, 2], or [N, 2 K] of rows drawn as K Gaussians: of the projected centres, for density control
+    means2d: (
+        Floats  # [N, 2], or [N, 2 K] of rows rendered as K Gaussians: of the projected centres, for density control
+    )
     shared: Mapping[str, Floats] = NOTHING  # with respect to the model's shared parameters, by name
 
 
@@ -134,7 +136,7 @@ def render(
 
 
 def choose_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
-    """Return the degree of the spherical harmonics to draw: the stored one, or less where less is wanted.
+    """Return the degree of the spherical harmonics to render: the wanted one, at most the stored one.
 
     Parameters
     ----------
@@ -247,7 +249,7 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
 
 
 class Request(NamedTuple):
-    """How to render a view, and what to return besides its colours."""
+    """The options for rendering a view, and the results to return besides its colours."""
 
     background: Floats | None = None
     """[3] RGB behind everything; black by default."""
@@ -259,7 +261,8 @@ class Request(NamedTuple):
     is_visible: Bools | None = None
     """[N] rows to render; all by default."""
     behind: Floats | None = None
-    """[H, W, 3] light that a wrapping renderer adds where it comes through the model; the output's extras count it."""
+    """[H, W, 3] light from behind the model, which a wrapping renderer adds to the image; the output's extras include
+    it."""
     wants: frozenset[str] = frozenset()
     """``depth``: a channel with ``sum w z``. ``stats``: blend statistics. ``median_depth``. ``surface``, in the
     output's extras: where each pixel's ray meets its dominant Gaussian. ``dominant_depth``, there too: [H, W] depth of
@@ -268,7 +271,7 @@ class Request(NamedTuple):
 
 
 class Renderer(NamedTuple):
-    """A way of drawing a model, and its gradient."""
+    """A way of rendering a model, and its gradient."""
 
     name: str
     render: Callable[[Model, View, Request], tuple[RenderOutput, Any]]
@@ -285,7 +288,7 @@ def as_model(model: Any) -> Model:
 
 
 def lit_from_behind(output: RenderOutput, request: Request) -> RenderOutput:
-    """Return the output with the light of :attr:`Request.behind` in its image, which removal changes are those of."""
+    """Return the output with the light of :attr:`Request.behind` in its image, as removal changes need it."""
     if request.behind is None:
         return output
     return output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
@@ -339,7 +342,7 @@ _EXTRAS: dict[str, Callable[[RenderTape, RenderOutput], Any]] = {
     "dominant_depth": _dominant_depth,
     "removal_changes": _removal_changes,
 }
-_OF_STATS = frozenset({"stats", "surface", "dominant_depth"})  # what needs blend statistics
+_OF_STATS = frozenset({"stats", "surface", "dominant_depth"})  # results that need blend statistics
 
 
 def _channels(wants: frozenset[str]) -> dict[str, slice]:
@@ -351,7 +354,7 @@ SPLATTING = Renderer("splatting", _render_model, render_vjp, _channels)
 
 
 class RenderSettings(NamedTuple):
-    """What all renderings of a training or an evaluation share; a :class:`Request` adds what one of them asks for."""
+    """Options shared by all renderings of a training or an evaluation; a :class:`Request` has those of one view."""
 
     background: Floats | None = None
     """[3] RGB behind everything; black by default."""

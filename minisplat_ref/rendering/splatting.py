@@ -37,7 +37,7 @@ class SplatTape(NamedTuple):
     conventions: Conventions
     backend: Backend
     projection: Projection  # radii are 0 where culled
-    channels: Floats  # [N, D] colours, then the depth if asked for
+    channels: Floats  # [N, D] colours, then the depth if requested
     background: Floats  # [D] 0 in a depth channel
     has_depth: bool
     bins: TileBins
@@ -65,7 +65,7 @@ def splat(
     with_stats: bool = False,
     with_median_depth: bool = False,
 ) -> SplatTape:
-    """Draw one view.
+    """Render one view of activated Gaussians.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ HasConics = TypeVar("HasConics", Projection, CompositeGradient)
 
 
 def _stage(name: str, with_depth: bool = False, with_stats: bool = False) -> Callable[[Dtype], None]:
-    """Return a task that draws and differentiates a view with one stage compiled."""
+    """Return a task that renders and differentiates a view with one stage compiled."""
 
     def compile_stage(dtype: Dtype) -> None:
         backend = replace(TYPED_REFERENCE, **{name: getattr(CPU, name)})
@@ -89,7 +89,7 @@ STAGES: dict[str, Callable[[Dtype], None]] = {
     "surface points": _surface_points,
     "removal of Gaussians": _removal_changes,
 }
-"""What is compiled together, by name; slow ones first, so that no process ends up with a slow one last."""
+"""Calls that compile functions together, by name; slow ones first, so that no process ends up with a slow one last."""
 
 FIRST_ITERATION = tuple(STAGES)[:9]
 """Those that the first iteration of every training needs."""
@@ -101,7 +101,7 @@ def compile_stage(name: str, dtype: Dtype) -> str:
     return ""
 
 
-def _in_kernel_types(function: Callable[Arguments, HasConics]) -> Callable[Arguments, HasConics]:
+def _widen_conics(function: Callable[Arguments, HasConics]) -> Callable[Arguments, HasConics]:
     """Return a stage of the reference whose conics, or their gradient, are float64 as in the kernels."""
 
     def stage(*args: Arguments.args, **named: Arguments.kwargs) -> HasConics:
@@ -125,9 +125,9 @@ TYPED_REFERENCE = replace(
     REFERENCE,
     tile_width=CPU.tile_width,
     tile_height=CPU.tile_height,
-    project=_in_kernel_types(REFERENCE.project),
+    project=_widen_conics(REFERENCE.project),
     composite=_with_records,
-    composite_vjp=_in_kernel_types(REFERENCE.composite_vjp),
+    composite_vjp=_widen_conics(REFERENCE.composite_vjp),
 )
 """The reference with results of the types that kernels return."""
 

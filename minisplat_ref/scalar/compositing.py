@@ -44,7 +44,7 @@ def factors(a, b, c):
 
 
 @scalar
-def half_of(factor):
+def halve_factor(factor):
     """Return half of a factor of a conic; a negative one becomes so large that it leaves no hits."""
     return select(factor >= ZERO, minimum(HALF * factor, HALF_FACTOR_MAX), HALF_FACTOR_MAX)
 

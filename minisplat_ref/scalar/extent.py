@@ -11,7 +11,7 @@ import numpy as np
 from minisplat_ref import constants
 from minisplat_ref.constants import INRIA_ROOT_MIN, INRIA_TILE
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import ceil, floor, log_of, maximum, minimum, sqrt
+from minisplat_ref.jit.lanes import ceil, floor, libm_log, maximum, minimum, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, THREE, TWO, ZERO
 
 RADIUS_MAX = np.float32(constants.RADIUS_MAX)  # exact in float32
@@ -32,7 +32,7 @@ class Extent(NamedTuple):
 @scalar
 def support_box(footprint, opacity, alpha_min, width, height):
     """Return the extent where alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) sigmas along x and y."""
-    squared = TWO * log_of(maximum(opacity / alpha_min, ONE))
+    squared = TWO * libm_log(maximum(opacity / alpha_min, ONE))
     rx = ceil(sqrt(squared * footprint.cov_xx))
     ry = ceil(sqrt(squared * footprint.cov_yy))
     x0 = floor(minimum(maximum(footprint.x - rx, ZERO), width))

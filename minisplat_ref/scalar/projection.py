@@ -74,7 +74,7 @@ def dot(a, b):
 
 
 @scalar
-def rows_of(matrix):
+def matrix_rows(matrix):
     """Return the rows of a 3 x 3 array as a tuple."""
     return (
         (matrix[0, 0], matrix[0, 1], matrix[0, 2]),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import log_of, maximum, minimum, select, sqrt
+from minisplat_ref.jit.lanes import libm_log, maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 FAR = np.float32(1e9)  # px
@@ -34,7 +34,7 @@ def visible_outline(a, slope, pivot, opacity, alpha_min, margin):
 
     Takes numbers or lanes.
     """
-    q = TWO * log_of(opacity / alpha_min)
+    q = TWO * libm_log(opacity / alpha_min)
     q = q + margin * (q + margin)
     inverse_a, pivot = ONE / maximum(a, FLAT), maximum(pivot, FLAT)
     # The inverse of the conic has 1 / a + slope^2 / pivot as its first entry, and -slope / pivot beside the diagonal.

@@ -6,8 +6,8 @@ largest blending weight, and joins the split set of :func:`minisplat_ref.strateg
 its gradient and size.
 
 The released code draws the children at random, as 3DGS does
-(:func:`minisplat_ref.strategy.clone_split.random_children`). The other form, here, cuts the longest axis. Left out: to
-collect the areas from one event to the next, which is an action of the recipe.
+(:func:`minisplat_ref.strategy.clone_split.random_children`). The other form, here, cuts the longest axis. Left out: the
+collection of the areas from one event to the next, which is an action of the recipe.
 """
 
 import math

@@ -6,7 +6,7 @@ cloned, large ones split.
 
 Left out on purpose: the removal of Gaussians that are large on the screen (radius above 20 px). The released code
 contains it, but the densification just before it zeroes the recorded radii, so it never removes anything; the paper's
-figures were measured like this. The removal of Gaussians that are large in the world works there, and is here.
+figures were measured like this. The removal of Gaussians that are large in the world works there, and is included.
 """
 
 import math

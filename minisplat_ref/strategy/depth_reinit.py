@@ -87,7 +87,7 @@ def centre_points(model: Any, view: View, settings: RenderSettings) -> PixelPoin
         In the dtype of the Gaussians.
     """
     output, _ = settings.render_view(model, view, frozenset({"dominant_depth"}), sh_degree=0)
-    return _on_rays(output.extras["dominant_depth"], output.alpha, view.camera, settings.conventions)
+    return _points_on_rays(output.extras["dominant_depth"], output.alpha, view.camera, settings.conventions)
 
 
 def blend_points(model: Any, view: View, settings: RenderSettings) -> PixelPoints:
@@ -109,7 +109,7 @@ def blend_points(model: Any, view: View, settings: RenderSettings) -> PixelPoint
     output, _ = settings.render_view(model, view, wants, sh_degree=0)
     sums = output.image[..., settings.renderer.channels(wants)["depth"]][..., 0]  # [H, W]
     depths = expected_depth(sums, output.alpha)  # [H, W]
-    return _on_rays(depths, output.alpha, view.camera, settings.conventions)
+    return _points_on_rays(depths, output.alpha, view.camera, settings.conventions)
 
 
 def reinitial_points(
@@ -229,7 +229,7 @@ def unproject(depths: Floats, camera: Camera) -> Floats:
     return (depths[:, :, None] * rays - camera.cam_from_world_t) @ camera.cam_from_world_R  # rows of R^T (x - t)
 
 
-def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Conventions) -> PixelPoints:
+def _points_on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Conventions) -> PixelPoints:
     points = unproject(depths, with_principal_point(camera, conventions))  # [H, W, 3]
     return PixelPoints(np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype), depths, alpha)
 

@@ -24,10 +24,11 @@ IsInside = Callable[[Floats, Camera], Bools]
 
 
 def may_be_inside(points: Floats, camera: Camera) -> Bools:
-    """Return for each point [P, 3] whether a camera may have it inside its image, [P]; of a pinhole, whether it has.
+    """Return for each point [P, 3] whether it may be inside a camera's image, [P]; for a pinhole the answer is exact.
 
-    Lenses are not known here (:mod:`minisplat_ref.mechanisms.cameras` is a layer above), so a camera with optics
-    counts as seeing all that its kind may: a fisheye and parallel rays every point, others the points in front of them.
+    Lenses are not known here (:mod:`minisplat_ref.mechanisms.cameras` is a layer above), so a camera with optics counts
+    as seeing all that a lens of its kind may see: a fisheye and parallel rays every point, others the points in front
+    of them.
     """
     x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
     is_in_front = z > 0
@@ -59,13 +60,13 @@ def initial_gaussians(
         float32.
     """
     if len(scene.points) > N_NEIGHBOURS:
-        return from_points(scene.points, scene.point_colors, sh_degree)
+        return gaussians_from_points(scene.points, scene.point_colors, sh_degree)
     cameras = [view.camera for view in scene.train_views]
     points = random_points(cameras, scene.extent, N_RANDOM_POINTS, rng, is_inside)
-    return from_points(points, rng.integers(0, 256, points.shape, np.uint8), sh_degree)
+    return gaussians_from_points(points, rng.integers(0, 256, points.shape, np.uint8), sh_degree)
 
 
-def from_points(points: Floats, colors: NDArray[np.uint8], sh_degree: int) -> Gaussians:
+def gaussians_from_points(points: Floats, colors: NDArray[np.uint8], sh_degree: int) -> Gaussians:
     """Return one round Gaussian per point, as large as the distance to its neighbours.
 
     Parameters
@@ -85,11 +86,11 @@ def from_points(points: Floats, colors: NDArray[np.uint8], sh_degree: int) -> Ga
     InputError
         There are fewer than 4 points.
     """
-    return from_means(points, ((colors / 255.0 - 0.5) / SH_C0).astype(np.float32), sh_degree)
+    return gaussians_from_means(points, ((colors / 255.0 - 0.5) / SH_C0).astype(np.float32), sh_degree)
 
 
-def from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
-    """Do the same as :func:`from_points` with colours given as coefficients, and in their dtype.
+def gaussians_from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
+    """Do as :func:`gaussians_from_points` with colours given as coefficients, and in their dtype.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints
 WINDOW = 5
 """Pixels, side of W."""
 HALF = WINDOW // 2
-"""Pixels beside the middle of a window."""
+"""Pixels on either side of the middle of a window."""
 CORRELATION_MIN = 0.7
 """Of a depth that counts. Noise alone correlates by 0.2, one over the root of 25 pixels. With 0.8, and with two
 neighbours that confirm, more points are right, and held-out photographs worse (``docs/measured/adaptive.md``).
@@ -78,7 +78,7 @@ def sweep_planes(view: GrayView, others: Sequence[GrayView], inverse_depths: Flo
     mean_a, var_a = _moments(view.gray)
     scores = np.empty((len(others), len(inverse_depths), height, width), np.float32)
     for k, other in enumerate(others):
-        rays = rays_between(view.camera, other.camera)
+        rays = relative_rays(view.camera, other.camera)
         for i, inverse_depth in enumerate(inverse_depths):
             b, is_inside = warp(rays, other, inverse_depth)
             mean_b, var_b = _moments(b)
@@ -106,7 +106,7 @@ class PlaneRays(NamedTuple):
     """[3] float32, world units."""
 
 
-def rays_between(camera: Camera, other: Camera) -> PlaneRays:
+def relative_rays(camera: Camera, other: Camera) -> PlaneRays:
     """Return the rays of a camera in the frame of another."""
     R = other.cam_from_world_R @ camera.cam_from_world_R.T
     t = other.cam_from_world_t - R @ camera.cam_from_world_t
@@ -170,7 +170,7 @@ def _moments(gray: Floats) -> tuple[Floats, Floats]:
 
 
 def _vertex(total: Floats, middle: Ints) -> Floats:
-    """Return where the parabola through three neighbouring planes is highest, in planes from the middle one."""
+    """Return the peak of the parabola through three neighbouring planes, in planes from the middle one."""
     left, center, right = (np.take_along_axis(total, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
     curvature = left - 2 * center + right
     is_peak = curvature < 0

@@ -40,7 +40,7 @@ class RemovalCosts(NamedTuple):
 
 
 def collect_removal_costs(model: Any, views: Sequence[View], settings: RenderSettings) -> RemovalCosts:
-    """Render every view beside its photograph, and accumulate in float64.
+    """Render every view, compare it with its photograph, and accumulate in float64.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.strategy.clone_split import logit
 from minisplat_ref.strategy.importance import mass_mask
-from minisplat_ref.strategy.initialization import from_means
+from minisplat_ref.strategy.initialization import gaussians_from_means
 from minisplat_ref.strategy.ops import Edit, keep, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
@@ -131,9 +131,9 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
         Sigma = sum w_m (Sigma_m + d_m d_m^T) / sum w_m     quaternion and scales by its eigenvectors and eigenvalues
         tau A = sum tau_m A_m,   o = 1 - exp(-tau)
 
-    tau is the optical thickness of a Gaussian, and A, with A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2, is a measure of its
-    cross-section. So two in one place, merged, absorb as much light as before, and two side by side become a larger one
-    of about their opacity.
+    tau is the optical thickness of a Gaussian, and A, with A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2, is its
+    cross-section up to a factor. So two in one place, merged, absorb as much light as before, and two side by side
+    become a larger one of about their opacity.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def _merge_clusters(members: Any, weights: Floats, labels: Ints) -> Gaussians:
     scales = np.exp(members.log_scales)
     sigmas = mean_of(covariances(members.quats, scales) + offsets[:, :, None] * offsets[:, None, :])  # [n, 3, 3]
     variances, axes = np.linalg.eigh(sigmas)
-    # No variance is below the least of the members', except by rounding.
+    # No variance is below the smallest of the members', except by rounding.
     variances = np.maximum(variances, np.minimum.reduceat(scales.min(axis=1) ** 2, starts)[:, None])
     axes[np.linalg.det(axes) < 0, :, 0] *= -1  # a rotation, not a reflection
 
@@ -291,4 +291,4 @@ def reinitialise(gaussians: Gaussians, sh_degree: int) -> Gaussians:
     gaussians : Gaussians
         In the dtype of the old ones.
     """
-    return from_means(gaussians.means, gaussians.sh_dc, sh_degree)
+    return gaussians_from_means(gaussians.means, gaussians.sh_dc, sh_degree)

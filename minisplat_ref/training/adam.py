@@ -46,7 +46,7 @@ class AdamState(NamedTuple, Generic[Parameters]):
     step: int
     """Steps taken."""
     joined: Mapping[str, int] = {}  # not NOTHING, which cannot be copied; it is never changed
-    """Of fields that came later, the steps that had been taken before: their moments began at zero there."""
+    """For fields that joined later, the step at which their moments began at zero."""
 
 
 def zero_moments(parameters: Parameters) -> AdamState[Parameters]:
@@ -55,11 +55,11 @@ def zero_moments(parameters: Parameters) -> AdamState[Parameters]:
 
 
 def _zeros_like(parameters: Parameters) -> Parameters:
-    zeros = {name: np.zeros_like(array) for name, array in fields_of(parameters).items()}
+    zeros = {name: np.zeros_like(array) for name, array in named_fields(parameters).items()}
     return zeros if isinstance(parameters, Mapping) else type(parameters)(**zeros)  # type: ignore[return-value]
 
 
-def fields_of(parameters: Any) -> dict[str, Floats]:
+def named_fields(parameters: Any) -> dict[str, Floats]:
     """Return the arrays of a population, or of shared parameters, by name."""
     return dict(parameters) if isinstance(parameters, Mapping) else parameters._asdict()
 
@@ -91,8 +91,7 @@ def adam_step(
     backend : Backend
         Implementation of the update.
     widths : mapping of str to ndarray of shape (N,)
-        For fields of which a row has only this many numbers, the first ones, to update; the others are neither read nor
-        written.
+        By field, the number of values of each row to update, the first ones; the others are neither read nor written.
 
     Returns
     -------
@@ -100,11 +99,11 @@ def adam_step(
         The same arrays, one step further.
     """
     rows = visible_ids if rule.is_visible_only else None
-    bundles = [fields_of(bundle) for bundle in (parameters, gradient, state.first, state.second)]
+    bundles = [named_fields(bundle) for bundle in (parameters, gradient, state.first, state.second)]
     for name, rate in ((name, rates[name]) for name in bundles[0]):
         arrays = (bundle[name] for bundle in bundles)
         values, g, first, second = (a.reshape(len(a), math.prod(a.shape[1:])) for a in arrays)  # [N, width] each
-        update = _update_of(rule, rate, state.step + 1 - state.joined.get(name, 0))
+        update = _field_update(rule, rate, state.step + 1 - state.joined.get(name, 0))
         if name in widths:
             backend.adam_update(values, g, first, second, rows, update, widths[name])
         else:
@@ -112,8 +111,8 @@ def adam_step(
     return state._replace(step=state.step + 1)
 
 
-def _update_of(rule: AdamRule, rate: float, step: int) -> AdamStep:
-    """Return the numbers of a field's step, of which it is the ``step``-th since its moments were zero."""
+def _field_update(rule: AdamRule, rate: float, step: int) -> AdamStep:
+    """Return the constants of a field's step, the ``step``-th since its moments were zero."""
     if not rule.has_bias_correction:
         return AdamStep(rate, rule.beta1, rule.beta2, rule.eps)
     root = math.sqrt(1 - rule.beta2**step)

@@ -1,4 +1,4 @@
-"""Save one view of one iteration as a file with everything its numbers depend on, to compute them again elsewhere."""
+"""Save one view of one iteration with everything that its numbers depend on, to recompute them elsewhere."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.rendering import Request
-from minisplat_ref.training.adam import fields_of
+from minisplat_ref.training.adam import named_fields
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Camera, Floats, Model, Optics, Scene, View
@@ -44,7 +44,7 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
     path : Path
     case : Case
     wrong : str
-        What was found to be wrong in it.
+        Description of what is wrong in it.
     settings : mapping
         Of the run; anything that JSON can hold. Empty unless the run was started from the command line.
     """
@@ -57,7 +57,7 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
         "request.sh_degree": degree if isinstance(degree, np.ndarray) else None,
     }
     arrays = {
-        **{f"gaussians.{name}": array for name, array in fields_of(case.model.gaussians).items()},
+        **{f"gaussians.{name}": array for name, array in named_fields(case.model.gaussians).items()},
         **{f"shared.{name}": array for name, array in case.model.shared.items()},
         "view.image": view.image,
         "view.R": camera.cam_from_world_R,

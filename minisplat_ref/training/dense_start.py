@@ -34,18 +34,19 @@ VIEWS_MAX = 32
 SPACING = 3.0
 """Pixels of the small photographs: nearer than this to another point no point is added."""
 COMPANY, REACH = 3, 4.0
-"""Other points, within so many spacings, without which a point is a mistake. No reason recorded for three and four."""
+"""A point with fewer others within this many spacings is a mistake. No reason recorded for three and four."""
 NEAR_A_RAY = 1.0
 """Pixels of the small photographs: a point is on the ray to a sparse point that is not farther from it."""
 ANGLE_GOOD, ANGLE_MAX = 6.0, 40.0
 """Degrees between the rays to a point: from the first on depth is well determined, beyond the second windows look
 different."""
 POINTS_MIN = 8
-"""Sparse points of a photograph that say how deep it is; with fewer, all that lie in its image count."""
+"""Minimum number of sparse points of a photograph from which its depths are taken; with fewer, all in its image
+count."""
 DEPTH_MARGINS = (0.7, 2.0)
 """Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept."""
 EXTENT_DEPTHS = (0.3, 20.0)
-"""In units of the scene's extent: depths that are swept where no point says how deep the scene is."""
+"""In units of the scene's extent: depths that are swept where a view has no points."""
 
 
 class _Small(NamedTuple):
@@ -70,7 +71,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
     colors : ndarray of shape (P, 3), uint8
     """
     views = scene.train_views[:: -(-len(scene.train_views) // VIEWS_MAX)]
-    smalls = [_shrink(view.load(), scene) for view in views]
+    smalls = [_shrink(view.load(), *_depth_range(view, scene)) for view in views]
     neighbours = choose_neighbours(views, scene.points)
     jobs = list(zip(smalls, neighbours, strict=True))
     progress = with_progress(jobs, "stereo", "photographs")
@@ -87,7 +88,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
         chosen = choose_spread(found, wide, points)
         points, spacings = np.concatenate([points, found[chosen]]), np.concatenate([spacings, wide[chosen]])
         colors = np.concatenate([colors, small.rgb[rows[chosen], columns[chosen]]])
-    stays = ~lie_before(points, views, scene.points) & have_company(points, spacings)
+    stays = ~is_before_sparse(points, views, scene.points) & have_company(points, spacings)
     stays[: len(scene.points)] = True
     return points[stays], colors[stays]
 
@@ -120,11 +121,11 @@ def choose_neighbours(views: Sequence[View], points: Floats) -> list[list[int]]:
     return chosen
 
 
-def lie_before(points: Floats, views: Sequence[View], sparse_points: Floats) -> Bools:
-    """Return which points [P] lie before a sparse point that a view shows beside them, within a small pixel.
+def is_before_sparse(points: Floats, views: Sequence[View], sparse_points: Floats) -> Bools:
+    """Return which points [P] lie in front of a sparse point that a view shows within a small pixel of them.
 
-    A photograph that shows a sparse point says that the ray up to it is free
-    (:mod:`minisplat_ref.strategy.line_of_sight`); stereo that is deceived by a repeated pattern puts points there.
+    Where a photograph shows a sparse point, the ray up to it is free (:mod:`minisplat_ref.strategy.line_of_sight`);
+    stereo that is deceived by a repeated pattern puts points there.
     """
     found = np.zeros(len(points), bool)
     for view in views:
@@ -160,7 +161,7 @@ def choose_spread(points: Floats, spacings: Floats, others: Floats) -> Ints:
     points : ndarray of shape (P, 3)
         Best first.
     spacings : ndarray of shape (P,)
-        Least distance of each.
+        Minimum distance of each.
     others : ndarray of shape (Q, 3)
         Points that are there already.
 
@@ -183,15 +184,14 @@ def choose_spread(points: Floats, spacings: Floats, others: Floats) -> Ints:
     return rows[stays]
 
 
-def _shrink(view: View, scene: Scene) -> _Small:
-    """Return a photograph made small, with the depths to sweep."""
+def _shrink(view: View, near: float, far: float) -> _Small:
+    """Return a photograph made small, with the depths to sweep, between the nearest and the farthest."""
     camera = view.camera
     factor = min(1.0, LONG_SIDE / max(camera.width, camera.height))
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
     rgb = resize_image(view.image, width, height)
     mask = None if view.mask is None else resize_mask(view.mask, width, height)
     gray = rgb.mean(axis=2, dtype=np.float32) / np.float32(255.0)
-    near, far = _depth_range(view, scene)
     return _Small(
         GrayView(rescale_camera(camera, width, height), gray), rgb, mask, np.linspace(1 / far, 1 / near, N_PLANES)
     )

@@ -26,9 +26,9 @@ def fine_tune(
     population : Gaussians or a relative's population
     scene : Scene
     recipe : Recipe
-        Of the length of the fine-tuning. :func:`without_events` keeps the number as it is.
+        Of the length of the fine-tuning. :func:`drop_events` keeps the number as it is.
     rng : Generator or int
-        Draws what events draw, and the order of views; or its seed.
+        Source of the random numbers of events and of the order of views; or its seed.
     on_step : callable, optional
         Called after each iteration.
     **arguments
@@ -40,6 +40,6 @@ def fine_tune(
     return train(scene, recipe, seed=0, state=state, on_step=on_step, **arguments).gaussians
 
 
-def without_events(recipe: Recipe) -> Recipe:
+def drop_events(recipe: Recipe) -> Recipe:
     """Return the recipe for fine-tuning: the number of Gaussians stays, and all stored harmonics are trained."""
     return recipe._replace(events=(), sh_milestones=(0,) * recipe.sh_degree)

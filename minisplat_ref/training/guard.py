@@ -18,7 +18,7 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import RenderGradient
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.training.adam import fields_of
+from minisplat_ref.training.adam import named_fields
 from minisplat_ref.training.case import Case, save_case
 from minisplat_ref.training.losses import Loss, Rendered, total_loss
 from minisplat_ref.types import NOTHING, Floats, Model, RenderOutput
@@ -103,12 +103,12 @@ def examine(case: Case) -> Examination:
 
 
 def _parameters(model: Model) -> dict[str, Floats]:
-    return {**fields_of(model.gaussians), **model.shared}
+    return {**named_fields(model.gaussians), **model.shared}
 
 
 def _gradients(gradient: RenderGradient, loss: Loss) -> dict[str, Floats]:
     """Return the derivatives with respect to the parameters: those via the image, and the direct ones of loss terms."""
-    through_image = {**fields_of(gradient.gaussians), **gradient.shared}
+    through_image = {**named_fields(gradient.gaussians), **gradient.shared}
     direct = {f"{name} (direct)": array for name, array in {**loss.v_gaussians, **loss.v_shared}.items()}
     return {f"v_{name}": array for name, array in {**through_image, **direct}.items()}
 
@@ -153,14 +153,14 @@ class Guard(NamedTuple):
     folder: Path | None = None
     """Folder to which the case is written; by default it is not."""
     settings: Mapping[str, Any] = NOTHING
-    """What the file says about the run, for those who replay it."""
+    """Settings of the run, stored in the file for its replay."""
 
     def is_due(self, step: int) -> bool:
         """Return whether parameters and gradient are checked in iteration ``step``."""
         return self.drops_steps or step % self.every == 0
 
-    def wrong_in(self, case: Case, loss: Loss, gradient: RenderGradient) -> Wrong | None:
-        """Return what is wrong if the step is to be dropped, None if it may be taken.
+    def check_step(self, case: Case, loss: Loss, gradient: RenderGradient) -> Wrong | None:
+        """Return the number that is not finite if the step must be dropped, None if it may be taken.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class Guard(NamedTuple):
             raise self.stop(case, wrong)
 
     def stop(self, case: Case, wrong: Wrong) -> BadNumbers:
-        """Write the case and return the error that says what is wrong."""
+        """Write the case and return the error that names what is wrong."""
         text = f"iteration {case.step}, view {case.view.name}, {wrong}"
         if wrong.stage == PARAMETERS and self.every > 1:
             text += f", since one of the last {self.every} iterations; --check-every 1 finds which"

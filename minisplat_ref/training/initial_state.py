@@ -50,7 +50,7 @@ def initial_state(
     representation = recipe.representation
     if populate is None:
         if recipe.starts_densely:
-            scene = _with_dense_points(scene, settings_of(recipe).get("budget"))
+            scene = _add_dense_points(scene, settings_of(recipe).get("budget"))
         first = initial_gaussians(scene, recipe.sh_degree, rng, representation.is_inside)
         gaussians = representation.extend(first, rng)
     else:
@@ -79,7 +79,7 @@ def initial_state(
     )
 
 
-def _with_dense_points(scene: Scene, budget: int | None) -> Scene:
+def _add_dense_points(scene: Scene, budget: int | None) -> Scene:
     """Return the scene with stereo's points besides its own, evenly chosen if there are more than the budget allows."""
     points, colors = densify_points(scene)
     n_own, n = len(scene.points), len(points)

@@ -23,7 +23,7 @@ from minisplat_ref import memory
 from minisplat_ref.io.stored_views import ReadingAhead, make_room
 from minisplat_ref.rendering import RenderGradient, RenderSettings
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.adam import AdamRule, adam_step, fields_of
+from minisplat_ref.training.adam import AdamRule, adam_step, named_fields
 from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
@@ -43,7 +43,7 @@ class Training(NamedTuple):
     recipe: Recipe
     """With the calibrations on that the training has switched on."""
     scene: Scene
-    """Its training views as they are trained on."""
+    """With its training views at their present size."""
     n_halvings: int
     """How often these were halved."""
     render_settings: RenderSettings
@@ -51,7 +51,7 @@ class Training(NamedTuple):
     ahead: ReadingAhead
     interruptions: Interruptions
     fetch: Callable[[TrainState], TrainState]
-    """Of the twin that iterates."""
+    """Copies newer arrays of a GPU into the state, as ``fetch`` of the page that iterates."""
 
 
 def iterate(state: TrainState, training: Training) -> StepReport:
@@ -60,7 +60,7 @@ def iterate(state: TrainState, training: Training) -> StepReport:
     with undrawn_on_error(state):
         case = draw_case(state, training)
         rendered, loss, gradient = differentiate(case, training)
-        wrong = guard.wrong_in(case, loss, gradient)
+        wrong = guard.check_step(case, loss, gradient)
         output = rendered.output._replace(image=rendered.channel("rgb"))
         assert output.visible_ids is not None, "a renderer says which rows a view sees"
         training.interruptions.defer()
@@ -89,7 +89,7 @@ def undrawn_on_error(state: TrainState) -> Iterator[None]:
 
 
 def draw_case(state: TrainState, training: Training) -> Case:
-    """Draw a view without replacement, shuffling them again when all have been seen, and say how it is rendered."""
+    """Draw a view without replacement, shuffling them again after the last, and make the request that renders it."""
     recipe, scene, step = training.recipe, training.scene, state.step + 1
     if not state.view_order:
         ids = trained_ids(len(scene.train_views), recipe.cooling, state.pace)
@@ -134,7 +134,7 @@ def take_step(state: TrainState, case: Case, loss: Loss, gradient: RenderGradien
 
 
 def _add(gradient: Any, direct: Mapping[str, Floats]) -> Any:
-    sums = {name: fields_of(gradient)[name] + v for name, v in direct.items()}
+    sums = {name: named_fields(gradient)[name] + v for name, v in direct.items()}
     return {**gradient, **sums} if isinstance(gradient, Mapping) else gradient._replace(**sums)
 
 

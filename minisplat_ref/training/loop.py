@@ -46,13 +46,14 @@ def train(
     seed : int
         Seed of the whole run; ignored when ``state`` is given, which has its own generator.
     state : TrainState, optional
-        Where to start or continue, changed in place and returned; default ``initial_state(scene, recipe, seed)``.
+        Start or continue from this state, which is changed in place and returned; default ``initial_state(scene,
+        recipe, seed)``.
     on_step : callable, optional
         Called with a :class:`StepReport` after every iteration.
     backend : Backend
     conventions : Conventions
     guard : Guard
-        How often numbers are checked, and what happens when one is not finite.
+        The interval between checks of numbers, and what happens when one is not finite.
 
     Returns
     -------
@@ -69,7 +70,7 @@ def train(
         After Ctrl-C: at once, or at the end of the iteration if that has begun to change the state, so that the
         ``state`` that was passed in is whole and can be saved. A second Ctrl-C does not wait for the end.
 
-    After any of these ``state.is_whole`` says whether the state lies between two iterations and can be saved.
+    After any of these ``state.is_whole`` is True if the state lies between two iterations and can be saved.
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=number_views(scene.train_views))

@@ -2,8 +2,8 @@
 
 A term is a function of what was rendered. It returns its value with its *cotangents*, the derivatives of the value with
 respect to the channels of the image, alpha, the fields of the population and the shared parameters, as far as it
-depends on them. The loss is ``L = sum_k w_k L_k``, and its cotangents are the same sum. A recipe says as data which
-terms a method has, and in which iterations.
+depends on them. The loss is ``L = sum_k w_k L_k``, and its cotangents are the same sum. A recipe lists the terms of a
+method, with their iterations, as data.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,13 +30,13 @@ class Rendered(NamedTuple):
     step: int
     """Iteration, from 1."""
     request: Request
-    """How it was rendered: backend, conventions, background."""
+    """Options of the rendering: backend, conventions, background."""
     held: Any = None
     """The same view at the values that derivatives hold constant, while a check moves the others; None: itself."""
 
     @property
     def constant(self) -> "Rendered":
-        """Return where a term takes what its derivatives hold constant, such as a target made of the rendering."""
+        """Return the inputs that derivatives hold constant, such as a target made from the rendering."""
         return self if self.held is None else self.held
 
     def channel(self, name: str) -> Floats:
@@ -65,9 +65,9 @@ class LossTerm(NamedTuple):
     function: Callable[[Rendered], tuple[float, Cotangents]]
     """Its settings are bound with ``functools.partial``, so that ``--set`` reaches them too."""
     weight: float
-    """Factor; 0 leaves out the term and what it wants rendered."""
+    """Factor; 0 leaves out the term and its outputs."""
     wants: frozenset[str] = frozenset()
-    """What has to be rendered for it besides ``rgb``; see :class:`minisplat_ref.rendering.Request`."""
+    """Outputs that it needs besides ``rgb``; see :class:`minisplat_ref.rendering.Request`."""
     start: int = 0
     stop: int | None = None
 

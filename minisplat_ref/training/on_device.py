@@ -41,7 +41,7 @@ from minisplat_ref.types import NOTHING, Floats, Gaussians, Ints, ProjectionGrad
 
 PHOTOGRAPHS_SHARE = 0.25  # of the free memory of the device, for photographs that stay there
 
-NOBODY: Ints = np.empty(0, np.int64)  # rows
+NO_ROWS: Ints = np.empty(0, np.int64)  # rows
 
 
 @contextmanager
@@ -78,25 +78,25 @@ class OnDevice:
         self._photographs: dict[tuple[str, tuple[int, ...]], Any] = {}
         self._room = PHOTOGRAPHS_SHARE * self.device.free_bytes()
         self._nothing: Any = None  # [H, W] zeros
-        self._said: set[str] = set()
+        self._noted: set[str] = set()
 
     def iterate(self, state: TrainState, training: Training) -> StepReport:
         """Do one iteration; an error before the step leaves the state as if the iteration had not begun."""
         guard, step = training.guard, state.step + 1
-        if why := why_not(state, training.recipe, step):
+        if why := find_obstacle(state, training.recipe, step):
             report = iteration.iterate(self.fetch(state), training)
-            return report._replace(notes=(*self._say_once(why), *report.notes))
+            return report._replace(notes=(*self._note_once(why), *report.notes))
         with undrawn_on_error(state):
             case = draw_case(state, training)
             found = self.differentiate(state, case)
-            wrong = self.wrong_in(state, case, found, guard)
+            wrong = self.check_step(state, case, found, guard)
             training.interruptions.defer()
         state.is_whole = False
         if wrong is None:
             self.take_step(state, case, found)
         if (guard.is_due(step) or case.recipe.may_edit(step)) and self.has_wrong():
             guard.check_parameters(case._replace(model=self.fetch(state).model), "Adam")
-        due, visible_ids, v_means2d = due_events(case, wrong), NOBODY, found.v_means2d
+        due, visible_ids, v_means2d = due_events(case, wrong), NO_ROWS, found.v_means2d
         if due:
             visible_ids = np.flatnonzero(self.device.to_host(found.radii)[:, 0] > 0)
             v_means2d = self.device.to_host(v_means2d)
@@ -142,8 +142,8 @@ class OnDevice:
         output = splats.output._replace(n_pairs=len(splats.bins.gaussian_ids))
         return Differentiated(output, loss, gradient, v_image, v.means2d, projection.radii)
 
-    def wrong_in(self, state: TrainState, case: Case, found: Differentiated, guard: Guard) -> Wrong | None:
-        """Check the loss, and the numbers when they are due; see :meth:`~minisplat_ref.training.guard.Guard.wrong_in`.
+    def check_step(self, state: TrainState, case: Case, found: Differentiated, guard: Guard) -> Wrong | None:
+        """Check the loss, and the arrays when they are due; as :meth:`~minisplat_ref.training.guard.Guard.check_step`.
 
         Only where something is wrong are the arrays copied back, for the check that names it.
         """
@@ -153,7 +153,7 @@ class OnDevice:
         nothing: Any = np.zeros(0)
         gradient = RenderGradient(there.gradient, nothing, nothing, nothing, there.v_means2d)
         loss = Loss(found.loss, there.v_image, None, NOTHING, NOTHING)
-        return guard.wrong_in(case._replace(model=self.fetch(state).model), loss, gradient)
+        return guard.check_step(case._replace(model=self.fetch(state).model), loss, gradient)
 
     def has_wrong(self, *bundles: Any) -> bool:
         """Return whether a parameter, or a number of further bundles, is not finite."""
@@ -170,9 +170,9 @@ class OnDevice:
                 widths["sh_rest"] = self.device.visible_widths(found.radii, limits)
         elif limits is not None:
             widths = {"sh_rest": self.device.to_device(limits)}
-        dense: Any = rule._replace(is_visible_only=False)  # the widths say which rows are seen
+        dense: Any = rule._replace(is_visible_only=False)  # the widths select the rows
         parameters = self.gaussians, found.gradient, self.adam
-        self.adam = adam_step(*parameters, rates, dense, NOBODY, self.backend, widths=widths)
+        self.adam = adam_step(*parameters, rates, dense, NO_ROWS, self.backend, widths=widths)
         self.is_newer = True
 
     def _take(self, state: TrainState, view: View) -> None:
@@ -206,11 +206,11 @@ class OnDevice:
             self._photographs[key] = both
         return self._photographs[key]
 
-    def _say_once(self, why: str) -> list[str]:
-        """Return a note of why arrays are in memory, unless it was said before."""
-        if why in self._said:
+    def _note_once(self, why: str) -> list[str]:
+        """Return a note with the reason why arrays are in memory, once for each reason."""
+        if why in self._noted:
             return []
-        self._said.add(why)
+        self._noted.add(why)
         stay = "arrays stay on the host, and stages that have kernels copy them"
         return [f"backend {self.backend.name}: {why} has no kernels for the GPU; {stay}"]
 
@@ -224,8 +224,8 @@ class OnDevice:
         return self.device.zeros((n, 1), dtype).reshape(n)
 
 
-def why_not(state: TrainState, recipe: Recipe, step: int) -> str | None:
-    """Return what of an iteration has no kernels for the device, None if all of it can stay there."""
+def find_obstacle(state: TrainState, recipe: Recipe, step: int) -> str | None:
+    """Return the part of an iteration that has no kernels for the device; None if all of it can stay there."""
     if recipe.renderer is not SPLATTING or type(state.gaussians) is not Gaussians:
         return f"the renderer {recipe.renderer.name}"
     if state.shared:

@@ -1,4 +1,4 @@
-"""A training that decides for itself when to end and what it needs: its measurements, its decisions, and why.
+"""A training that decides when to end and what it needs: its measurements, its decisions, and the reasons.
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
 measure the gain of more iterations; test views are never used. When an action of the recipe decides that the gain is
@@ -24,7 +24,7 @@ class Measurement(NamedTuple):
     n_pairs: int
     """Pairs (tile, Gaussian) of all iterations so far: the work."""
     ssims: tuple[float, ...] = ()
-    """Of each view; empty where only the PSNR was asked for."""
+    """Of each view; empty where only the PSNR was computed."""
 
     @property
     def psnr(self) -> float:
@@ -74,7 +74,7 @@ class Pace(NamedTuple):
 
     @property
     def n_finer(self) -> int:
-        """Return how often it was decided to train on views of twice the width and height."""
+        """Return the number of decisions to train on views of twice the width and height."""
         return sum(decision.what == FINER for decision in self.decisions)
 
     def with_decision(self, decision: Decision) -> "Pace":
@@ -97,7 +97,7 @@ class Pace(NamedTuple):
 
 
 class Cooling(NamedTuple):
-    """How a training without a schedule ends."""
+    """The end of a training without a schedule."""
 
     part: float
     """Length of the cool-down, as a fraction of the iterations before it."""
@@ -125,7 +125,7 @@ class Cooling(NamedTuple):
 
 
 def held_out_ids(n_views: int, every: int) -> list[int]:
-    """Return which training views are held back: every ``every``-th, at least two, spread over the list.
+    """Return the training views that are held back: every ``every``-th, at least two, spread over the list.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def trained_ids(n_views: int, cooling: Cooling | None, pace: Pace) -> list[int]:
     return [k for k in range(n_views) if k not in held]
 
 
-def to_metadata(pace: Pace) -> dict[str, Any]:
+def pace_to_json(pace: Pace) -> dict[str, Any]:
     """Return the pace as it is stored in a checkpoint."""
     return {
         **pace._asdict(),
@@ -156,8 +156,8 @@ def to_metadata(pace: Pace) -> dict[str, Any]:
     }
 
 
-def from_metadata(value: Mapping[str, Any]) -> Pace:
-    """Read what :func:`to_metadata` wrote.
+def pace_from_json(value: Mapping[str, Any]) -> Pace:
+    """Read what :func:`pace_to_json` wrote.
 
     Raises
     ------

@@ -102,7 +102,7 @@ class Rates(NamedTuple):
 
 
 def n_coefficients(degrees: Ints) -> Ints:
-    """Return the coefficients above degree 0 that colours of these degrees have in each channel."""
+    """Return the number of coefficients above degree 0 that colours of these degrees have in each channel."""
     return (degrees.astype(np.int64) + 1) ** 2 - 1
 
 

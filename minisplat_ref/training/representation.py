@@ -31,7 +31,7 @@ WORLD_UNITS: Units = {"means": Unit.PLACE, "log_scales": Unit.LOG_LENGTH}
 
 
 class Representation(NamedTuple):
-    """What is trained to represent a scene."""
+    """The population that represents a scene, its initialisation and its renderer."""
 
     name: str
     population: Any = Gaussians
@@ -42,14 +42,14 @@ class Representation(NamedTuple):
     """Returns the initial shared parameters."""
     renderer: Renderer = SPLATTING
     rates: Rates = Rates({}, frozenset())
-    """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
+    """Learning rates of fields and shared parameters for which the recipe has none."""
     takes_optics: bool = False
-    """Whether the renderer draws through lenses; then scenes are read as photographed."""
+    """Whether the renderer supports lenses; then scenes are read as photographed."""
     is_inside: IsInside = may_be_inside
-    """Whether points are inside a camera's image, as the renderer draws it; random points that no camera sees are
+    """Whether points are inside a camera's image, as the renderer defines it; random points that no camera sees are
     left out."""
     units: Units = WORLD_UNITS
-    """What of population and shared parameters is in world units, and how: see :mod:`minisplat_ref.io.frames`."""
+    """The fields and shared parameters in world units, and their kinds of unit: see :mod:`minisplat_ref.io.frames`."""
     extends: frozenset[str] = frozenset()
     """Names of further representations whose populations ``extend`` takes: a training can start from their models."""
     from_file: Callable[[Path, Scene, int, np.random.Generator], Any] | None = None
@@ -61,6 +61,6 @@ GAUSSIANS = Representation("gaussians")
 """3DGS: static Gaussians with spherical harmonics."""
 
 
-def floats_of(population: Any) -> int:
-    """Return how many floats a primitive of the population has."""
+def count_floats(population: Any) -> int:
+    """Return the number of floats of a primitive of the population."""
     return sum(int(np.prod(field.shape[1:])) for field in population)

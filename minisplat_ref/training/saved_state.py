@@ -16,9 +16,9 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.io.frames import frame_from_json, frame_to_json
-from minisplat_ref.training.adam import AdamState, fields_of
+from minisplat_ref.training.adam import AdamState, named_fields
 from minisplat_ref.training.calibration import CALIBRATIONS
-from minisplat_ref.training.pace import Pace, from_metadata, to_metadata
+from minisplat_ref.training.pace import Pace, pace_from_json, pace_to_json
 from minisplat_ref.training.rates import n_coefficients
 from minisplat_ref.training.recipe_settings import apply_decisions
 from minisplat_ref.training.schedule import Recipe, describe
@@ -36,7 +36,7 @@ GAUSSIAN_SHAPES: Mapping[str, tuple[tuple[int, ...], ...]] = {
 
 
 class Counters(NamedTuple):
-    """How far a training has come."""
+    """The progress of a training."""
 
     step: int
     adam_step: int
@@ -75,7 +75,9 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
         **{"gaussians": state.gaussians, "first": state.adam.first, "second": state.adam.second},
         **{"shared": state.shared, "shared_first": state.shared_adam.first, "shared_second": state.shared_adam.second},
     }
-    arrays = {f"{group}.{name}": array for group, fields in groups.items() for name, array in fields_of(fields).items()}
+    arrays = {
+        f"{group}.{name}": array for group, bundle in groups.items() for name, array in named_fields(bundle).items()
+    }
     arrays |= {f"stats.{name}": field for name, field in state.stats.items()}
     metadata = {
         "step": state.step,
@@ -86,7 +88,7 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
         "recipe": describe(recipe),
     }
     if recipe.cooling is not None:
-        metadata["pace"] = to_metadata(state.pace)
+        metadata["pace"] = pace_to_json(state.pace)
     if state.shared_adam.joined:
         metadata["shared_adam_joined"] = dict(state.shared_adam.joined)
     if state.frame != FILE_FRAME:
@@ -105,7 +107,7 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
     arrays, metadata = load_checkpoint(path)
     counters = read_counters(path, metadata)
     if metadata.get("recipe") != json.loads(json.dumps(describe(recipe))):
-        name, length = written_by(metadata)
+        name, length = recorded_recipe(metadata)
         raise InputError(
             f"{path} was written by recipe {name} of {length} iterations with other settings than"
             f" {recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
@@ -129,8 +131,8 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
     )
 
 
-def written_by(metadata: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the name and length, in iterations, of the recipe under which a checkpoint says it was written."""
+def recorded_recipe(metadata: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the name and length, in iterations, of the recipe that a checkpoint records."""
     recipe = metadata.get("recipe")
     recipe = recipe if isinstance(recipe, dict) else {}
     n_iterations = recipe.get("iterations")
@@ -177,7 +179,7 @@ def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
 
 
 def read_pace(path: str | Path, value: Any) -> Pace:
-    """Return what a training that decides its own length had measured and decided.
+    """Return the measurements and decisions of a training that decides its own length.
 
     Raises
     ------
@@ -185,7 +187,7 @@ def read_pace(path: str | Path, value: Any) -> Pace:
         It is missing or malformed.
     """
     try:
-        pace = from_metadata(value)
+        pace = pace_from_json(value)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DamagedCheckpoint(f"{path}: pace is no record of measurements and decisions; {WAY_OUT}") from error
     if not {calibration.name for calibration in CALIBRATIONS} >= set(pace.switched_on):

@@ -1,6 +1,6 @@
-"""Training on smaller views at first: how often they are halved in each iteration, and the halved views.
+"""Training on smaller views at first: the number of halvings in each iteration, and the halved views.
 
-A recipe asks for it by an event (:class:`minisplat_ref.training.schedule.SmallerViews`). It ends at a given iteration
+A recipe has an event for it (:class:`minisplat_ref.training.schedule.SmallerViews`). It ends at a given iteration
 (Mini-Splatting2), or the training takes the halvings back one by one when it decides to (``adaptive``).
 """
 
@@ -17,7 +17,7 @@ SIDE_MIN = 16  # pixels: a tile
 
 
 def halve_large_views(scene: Scene, *, min_side: float, max_halvings: float = math.inf) -> int:
-    """Return how often to halve views at first: as often as no side becomes shorter than ``min_side``.
+    """Return the number of halvings at first, the largest that leaves no side shorter than ``min_side``.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class ViewSizes:
         self._scenes = {0: scene}
 
     def count_halvings(self, step: int, pace: Pace) -> int:
-        """Return how often the views of an iteration, counted from 1, are halved."""
+        """Return the number of halvings of the views in an iteration, counted from 1."""
         if pace.cooling_from is not None:
             return 0
         return max([0, *(times - pace.n_finer for event, times in self._planned if event.is_due(step))])

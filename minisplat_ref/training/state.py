@@ -46,7 +46,7 @@ class TrainState:
     shared_adam: AdamState[Any] = field(default_factory=lambda: AdamState({}, {}, 0))
     """Moments of the shared parameters."""
     pace: Pace = field(default_factory=Pace)
-    """What a recipe that decides its own length has measured and decided."""
+    """Measurements and decisions of a recipe that decides its own length."""
     is_whole: bool = True
     """False while an iteration changes the state; if it stays so, the iteration failed halfway: do not save."""
     max_rows: float = math.inf
@@ -60,7 +60,7 @@ class TrainState:
         return Model(self.gaussians, self.shared)
 
 
-def unheard(text: str) -> None:
+def ignore_message(text: str) -> None:
     """Discard a message."""
 
 
@@ -78,20 +78,21 @@ class Iteration(NamedTuple):
     visible_ids: Ints
     """[V] rows that the view saw (radius above zero), ascending."""
     v_means2d: Floats
-    """[N, 2] gradient of the loss with respect to the projected centres, per pixel; [N, 2 K] if rows are drawn as K."""
+    """[N, 2] gradient of the loss with respect to the projected centres, per pixel; [N, 2 K] if rows are rendered as
+    K."""
     render_settings: RenderSettings = RenderSettings()
-    """How the model is rendered."""
+    """Options of rendering the model."""
     representation: Representation = GAUSSIANS
-    """What is trained."""
+    """Population and renderer."""
     step: int = 0
     """Its number, from 1."""
     iterations: int = 0
     """Upper limit of the training's length."""
     cooling: Cooling | None = None
-    """How it ends, if it has no schedule."""
+    """The end of a training without a schedule."""
     n_halvings: int = 0
-    """How often the views were halved in width and height."""
-    say: Callable[[str], None] = unheard
+    """Number of times that the views were halved in width and height."""
+    say: Callable[[str], None] = ignore_message
     """Tells the user something in one line, at once; a note for the record alone is returned instead."""
     fetch: Callable[[], Any] = lambda: None
     """Copies parameters and moments into the state, where a GPU has newer ones. Only actions whose event does not read
@@ -99,7 +100,7 @@ class Iteration(NamedTuple):
 
 
 class FiredEvent(NamedTuple):
-    """What one event of the recipe did in an iteration; events of every iteration (``During``) are not recorded."""
+    """The record of one event in an iteration; events of every iteration (``During``) are not recorded."""
 
     action: str
     """Name of the action, as in ``describe``."""
@@ -108,13 +109,13 @@ class FiredEvent(NamedTuple):
     n_after: int
     """Gaussians when it was done."""
     seconds: float
-    """How long it took."""
+    """Time that it took."""
     note: str | None = None
     """The action's note, such as why it has changed nothing."""
 
 
 class StepReport(NamedTuple):
-    """What ``train`` passes to ``on_step`` after every iteration."""
+    """The report that ``train`` passes to ``on_step`` after every iteration."""
 
     step: int
     """Iterations done, from 1."""
@@ -131,7 +132,7 @@ class StepReport(NamedTuple):
     last_step: int | None = None
     """Iteration at which the training ends; None while a recipe that decides this has not done so."""
     n_halvings: int = 0
-    """How often the views of the next iteration are halved in width and height."""
+    """Number of times that the views of the next iteration are halved in width and height."""
     fired: tuple[FiredEvent, ...] = ()
     """Events that acted after the gradient step, in their order."""
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.bench import benchmark, contenders, interleaving, profiling, training_time, workloads
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.passes import RASTERIZATION
-from minisplat_ref.bench.peers import peers_of
+from minisplat_ref.bench.peers import make_peers
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.images import read_image
 from minisplat_ref.oracle.planted import plant
@@ -288,7 +288,7 @@ def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.skipif(not (find_spec("torch") and find_spec("gsplat")), reason="needs torch and gsplat, the extra peers")
 def test_gsplat_is_a_contender():
-    [gsplat], program = peers_of(["gsplat-torch"])
+    [gsplat], program = make_peers(["gsplat-torch"])
     [_, case] = benchmark.benchmark(tiny(), [*contenders.choose(()), gsplat], repeats=1)
     assert program is None and case.passed, case
     assert case.name == "synth/gsplat-torch" and case.figures["both ms"] > 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.cpu.compositing.tile_state import lists_of
+from minisplat_ref.cpu.compositing.tile_state import pack_lists
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.gaussian_splatting import GS
 from minisplat_ref.rendering import Request
@@ -69,10 +69,10 @@ def test_kernels_of_the_cpu_refuse_other_tiles():
     camera, g = make_camera(40, 30), make_gaussians(np.random.default_rng(0), 3)
     projection = REFERENCE.project(*activated(g), camera, GSPLAT_MAIN)  # nothing has to be compiled for it
     bins = REFERENCE.bin_gaussians(projection, TileGrid(40, 30, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
-    lists_of(bins)
+    pack_lists(bins)
     bins = bins._replace(grid=TileGrid(40, 30, 16, 16))
     with pytest.raises(InputError, match="32 x 16 pixels, not of 16 x 16"):
-        lists_of(bins)
+        pack_lists(bins)
 
 
 FAKE = """

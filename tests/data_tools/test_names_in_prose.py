@@ -1,8 +1,8 @@
 """Names that prose puts in backticks exist: in docstrings, comments, the text of notebooks and the pages of docs/.
 
 A name is an identifier with an underscore, or one that is called. Symbols of formulas, such as ``w_i`` and ``x_file``,
-are not names. A role such as ``:func:`.hits.goes_on``` must lead to a module or into one, from where it stands. All is
-read from the sources and nothing is imported, so that modules count whose packages are not installed.
+are not names. A role such as ``:func:`.hits.is_accepted``` must lead to a module or into one, from where it stands. All
+is read from the sources and nothing is imported, so that modules count whose packages are not installed.
 """
 
 import ast

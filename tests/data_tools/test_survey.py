@@ -66,7 +66,7 @@ def test_a_command_notices_or_not(monkeypatch, capsys):
 def test_an_exception_is_noticed():
     broken = BY_NAME["continues where T equals the stop"]._replace(wrong="1 / 0 + conventions")
     assert survey(broken, ["compare reference"]).notices == {"compare reference": True}
-    assert "/ 0" not in inspect.getsource(hits.goes_on) and hits.goes_on(np.ones(1), GSPLAT_MAIN)
+    assert "/ 0" not in inspect.getsource(hits.is_accepted) and hits.is_accepted(np.ones(1), GSPLAT_MAIN)
 
 
 ADAM = ["--only", "*mean", "--commands", "Adam"]  # of three errors

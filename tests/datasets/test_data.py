@@ -11,7 +11,7 @@ import pytest
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets import catalogue, fetching
-from minisplat_ref.datasets.catalogue import CATALOGUE, DataSet, File, files_of
+from minisplat_ref.datasets.catalogue import CATALOGUE, DataSet, File, scene_files
 from minisplat_ref.datasets.fetching import fetch
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface import progress
@@ -193,7 +193,7 @@ def test_an_unknown_name_says_what_was_meant(capsys):
 def test_a_path_that_leaves_the_folder_does_not(server, tmp_path):
     path = tmp_path / "package" / "catalogue.sha256"
     path.write_text(f"# heading\n{hashlib.sha256(b'free').hexdigest()} 4 small ../../../etc/passwd\n")
-    assert [file.path for file in files_of("small")] == ["photos/passwd"]
+    assert [file.path for file in scene_files("small")] == ["photos/passwd"]
 
 
 def test_the_list_has_every_set_its_size_its_licence_and_its_place(capsys):
@@ -208,7 +208,7 @@ def test_the_list_has_every_set_its_size_its_licence_and_its_place(capsys):
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_every_set_is_whole(name):
     """The licence comes first; hashes are of 64 digits, commits of 40, and no two files share a place."""
-    data_set, listed = CATALOGUE[name], files_of(name)
+    data_set, listed = CATALOGUE[name], scene_files(name)
     assert listed[0].path == data_set.licence_file
     assert len(data_set.commit) == 40 and int(data_set.commit, 16)
     assert all(len(file.sha256) == 64 and int(file.sha256, 16) and file.n_bytes > 0 for file in listed)
@@ -229,7 +229,7 @@ def test_every_file_of_the_catalogue_belongs_to_a_set():
 def test_the_file_that_is_here_has_the_hash_of_the_catalogue(shared_data):
     """gsplat's points are the one file that is measured as it is published."""
     content = (shared_data / "gsplat_garden" / "test_garden.npz").read_bytes()
-    file = files_of("garden")[1]
+    file = scene_files("garden")[1]
     assert (file.n_bytes, file.sha256) == (len(content), hashlib.sha256(content).hexdigest())
 
 

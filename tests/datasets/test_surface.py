@@ -12,8 +12,8 @@ from minisplat_ref.datasets.synthetic import surface as surface_module
 from minisplat_ref.datasets.synthetic.files import load_depths, write_scene
 from minisplat_ref.datasets.synthetic.surface import (
     chamfer,
+    nearest_surface,
     surface_distance,
-    surface_near,
     true_surface,
     unproject_views,
 )
@@ -61,7 +61,7 @@ def test_half_a_grid_is_near_the_whole_one_and_not_the_other_way():
 
 def test_what_counts_of_the_gaussians(rng):
     """Units are extents; what is hardly opaque or far away does not count; nothing left is None."""
-    surface = surface_near(plane(0.0), [make_camera(8, 8)._replace(cam_from_world_t=np.zeros(3))], extent=2.0)
+    surface = nearest_surface(plane(0.0), [make_camera(8, 8)._replace(cam_from_world_t=np.zeros(3))], extent=2.0)
     means = np.concatenate([plane(0.1), [[0.0, 0, 1.5]], [[0.0, 0, 6.1]]])
     logits = np.full(len(means), 1.0)
     logits[-2] = np.log(0.099 / 0.901)
@@ -74,9 +74,9 @@ def test_what_counts_of_the_gaussians(rng):
 
 def test_truth_is_bounded_and_repeats(monkeypatch):
     monkeypatch.setattr(surface_module, "POINTS_MAX", 10)
-    one, other = (surface_near(plane(0.0), [make_camera(8, 8)], extent=9.0).cloud.data for _ in range(2))
+    one, other = (nearest_surface(plane(0.0), [make_camera(8, 8)], extent=9.0).cloud.data for _ in range(2))
     assert len(np.unique(one, axis=0)) == 10 and np.array_equal(one, other)
-    assert surface_near(plane(0.0) + 100, [make_camera(8, 8)], extent=9.0) is None
+    assert nearest_surface(plane(0.0) + 100, [make_camera(8, 8)], extent=9.0) is None
 
 
 def test_true_surface_is_what_the_training_views_show(synthetic, folder):

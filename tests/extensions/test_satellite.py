@@ -491,7 +491,7 @@ def test_backends_agree_on_what_is_highest(rng):
 def test_the_oracle_finds_a_wrong_order_of_altitudes(is_wrong, monkeypatch):
     """Negative floats in the order of their bits, as they once were: no gradient is wrong then."""
     if is_wrong:
-        monkeypatch.setattr("minisplat_ref.cpu.tiling.keys_of", lambda depths: depths.view(np.int64))
+        monkeypatch.setattr("minisplat_ref.cpu.tiling.depth_keys", lambda depths: depths.view(np.int64))
     own, compared = agreement_cases((REFERENCE, CPU), GSPLAT_MAIN, SEEN_FROM_ABOVE, stages)
     assert own == [] and [case.passed for case in compared] == [True, not is_wrong]
     assert "affine" in compared[1].name

@@ -36,7 +36,7 @@ def main(path):
     for dtype, n_bits in BITS.items():
         for n in SORTED:
             keys = cuda.to_device(make_keys(n, dtype))
-            pair = sorting.sort_by_key(keys, sorting.order_of(n), n_bits)
+            pair = sorting.sort_by_key(keys, sorting.initial_order(n), n_bits)
             found[dtype.__name__, n] = tuple(array.copy_to_host() for array in pair)
     orders = {t.__name__: to_host(tiling.order_by_depth(np.array(DEPTHS, t))) for t in (np.float32, np.float64)}
     Path(path).write_bytes(pickle.dumps((sums, found, orders)))

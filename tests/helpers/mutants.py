@@ -13,7 +13,7 @@ DERIVATIVES = (
     "_vjp",
     "_gradient",
     "_jacobian",
-    "_sum_behind",
+    "_suffix_sums",
 )  # ends of the names of functions that only gradients use
 FIRST_OF = {"clip": 0, "sign": 0, "swapaxes": 0, "where": 1, "maximum": 0}  # np.f(...) becomes this argument of it
 

@@ -14,7 +14,7 @@ from minisplat_ref.datasets.undistort import undistort_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, read_image, viewpoints
 from minisplat_ref.io.images import write_image
-from minisplat_ref.io.names import file_names, name_inside, path_beside
+from minisplat_ref.io.names import file_names, name_inside, nearby_path
 from minisplat_ref.metrics import ViewMetrics
 from minisplat_ref.types import number_views
 from photo_scenes import PINHOLE, colored_image, edit_transforms, write_colmap, write_transforms
@@ -58,7 +58,7 @@ def nothing_outside(tmp_path):
 def test_path_beside_a_file(tmp_path, name, expected, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name, expected = (text.format(here=tmp_path) for text in (name, expected))
-    assert str(path_beside(Path("scene/transforms.json"), name)) == expected
+    assert str(nearby_path(Path("scene/transforms.json"), name)) == expected
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_path_beside_a_file(tmp_path, name, expected, monkeypatch):
 )
 def test_path_that_leads_elsewhere(tmp_path, name):
     with pytest.raises(InputError, match="lies neither in the folder of this file nor in one next to it; move it"):
-        path_beside(tmp_path / "scene" / "transforms.json", name.format(here=tmp_path))
+        nearby_path(tmp_path / "scene" / "transforms.json", name.format(here=tmp_path))
 
 
 def test_absolute_path_below_a_folder_that_was_reached_through_a_link(tmp_path):
@@ -74,7 +74,7 @@ def test_absolute_path_below_a_folder_that_was_reached_through_a_link(tmp_path):
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "scene").symlink_to(tmp_path / "disk" / "scene")
     path = tmp_path / "disk" / "scene" / "a.png"
-    assert path_beside(tmp_path / "home" / "scene" / "transforms.json", str(path)) == path
+    assert nearby_path(tmp_path / "home" / "scene" / "transforms.json", str(path)) == path
 
 
 def test_names_inside_a_folder():

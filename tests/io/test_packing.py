@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.io.packing.morton import cells_of, morton_codes, morton_order
+from minisplat_ref.io.packing.morton import morton_cells, morton_codes, morton_order
 from minisplat_ref.io.packing.planes import from_planes, to_planes, unzigzag, zigzag
 
 # Morton order and planes of bytes
@@ -33,8 +33,8 @@ def test_cells_are_cubes_or_have_the_proportions_of_the_box():
     """Of points in a box of 8 x 2 x 0, the third has half of the longest side, and all of the second axis."""
     points = np.array([[-1.0, 5, 3], [7, 5, 3], [3, 7, 3]])
     last = 2**21 - 1
-    assert_array_equal(cells_of(points), [[0, 0, 0], [last, 0, 0], [2**20, 2**19, 0]])
-    assert_array_equal(cells_of(points, is_cubic=False), [[0, 0, 0], [last, 0, 0], [2**20, last, 0]])
+    assert_array_equal(morton_cells(points), [[0, 0, 0], [last, 0, 0], [2**20, 2**19, 0]])
+    assert_array_equal(morton_cells(points, is_cubic=False), [[0, 0, 0], [last, 0, 0], [2**20, last, 0]])
 
 
 def test_morton_neighbours_are_near(rng):

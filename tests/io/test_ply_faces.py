@@ -6,7 +6,7 @@ from numpy.testing import assert_array_equal
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.ply_faces import read_faces
-from minisplat_ref.io.ply_file import n_rows_of, read_vertices, write_vertices
+from minisplat_ref.io.ply_file import count_rows, read_vertices, write_vertices
 
 CORNERS = [[0, 1, 2], [3, 2, 1, 0], [1, 0, 3]]
 LIST = "property list uchar int vertex_indices"
@@ -62,7 +62,7 @@ def test_written_triangles_are_read(tmp_path, rng):
     triangles = np.array([[0, 1, 2], [4, 3, 2]])
     write_vertices(tmp_path / "a.ply", columns, triangles)
     assert_array_equal(np.stack(read_faces(tmp_path / "a.ply")), triangles)
-    assert n_rows_of(tmp_path / "a.ply", "face") == 2
+    assert count_rows(tmp_path / "a.ply", "face") == 2
     for name, column in read_vertices(tmp_path / "a.ply").items():
         assert_array_equal(column, columns[name], strict=True)
 

@@ -9,7 +9,6 @@ from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
-    bits_between,
     broadcast,
     cast,
     floor,
@@ -21,6 +20,7 @@ from minisplat_ref.jit.lanes import (
     maximum,
     minimum,
     prefetch,
+    range_mask,
     reduce_any,
     reduce_max,
     reduce_sum,
@@ -178,8 +178,8 @@ def test_lowest_bit(bits):
 )
 def test_bits_between_bounds(firsts, ends, quarters, dtype):
     bounds, expected = np.array([*firsts, *ends], dtype), int("".join(reversed(quarters)), 16)
-    assert bits_between(bounds) == expected
-    assert compiled(lambda bounds: bits_between(load(bounds, 0)))(bounds) == expected
+    assert range_mask(bounds) == expected
+    assert compiled(lambda bounds: range_mask(load(bounds, 0)))(bounds) == expected
 
 
 def test_prefetch_changes_nothing():

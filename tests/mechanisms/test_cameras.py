@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from gradcheck import check_inner_products
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.lens import COEFFICIENTS, Lens, optics_of
+from minisplat_ref.io.lens import COEFFICIENTS, Lens, lens_optics
 from minisplat_ref.mechanisms.cameras.affine import AffineCamera, orthographic, project, project_vjp, with_affine
 from minisplat_ref.mechanisms.cameras.distortion import brown_limit, fisheye_limit
 from minisplat_ref.mechanisms.cameras.models import (
@@ -46,7 +46,7 @@ FOLDED = Optics("brown", (-0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 def camera_of(model):
     n = COEFFICIENTS[model][1]
     fx, fy = PARAMS[model][0], PARAMS[model][n - 3]
-    optics = optics_of(Lens(model, PARAMS[model]), "a.png")
+    optics = lens_optics(Lens(model, PARAMS[model]), "a.png")
     return make_camera(640, 480, fx=fx, fy=fy)._replace(optics=optics)
 
 
@@ -179,7 +179,7 @@ def test_unknown_optics_are_refused():
     with pytest.raises(InputError, match="'sphere' are not known: choose from brown"):
         model_of(make_camera()._replace(optics=Optics("sphere")))
     with pytest.raises(InputError, match=r"a\.png: camera model FOV is not one of SIMPLE_RADIAL"):
-        optics_of(Lens("FOV", (1.0, 1.0, 0.0, 0.0, 0.5)), "a.png")
+        lens_optics(Lens("FOV", (1.0, 1.0, 0.0, 0.0, 0.5)), "a.png")
 
 
 # --- the unscented transform ---

@@ -13,7 +13,7 @@ from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
 from minisplat_ref.rendering import RenderSettings, render, render_vjp
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
@@ -323,7 +323,7 @@ def test_few_points_far_away_do_not_become_veils(state, iteration, monkeypatch, 
     """Their neighbours are as far away as the cameras: without a limit they would reach them."""
     points = np.vstack([rng.uniform(-0.1, 0.1, (50, 3)), 200.0 * np.eye(3)]).astype(np.float32)
     points_and_colors = points, np.zeros((53, 3), np.uint8)
-    state.gaussians = from_points(*points_and_colors, sh_degree=0)  # the restart's
+    state.gaussians = gaussians_from_points(*points_and_colors, sh_degree=0)  # the restart's
     before = np.exp(state.gaussians.log_scales)
     monkeypatch.setattr(mini_splatting, "reinitial_points", lambda *_, **__: points_and_colors)
     act = next(event.action for event in RECIPES[recipe].events if action in repr(event.action))

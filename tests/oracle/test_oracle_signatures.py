@@ -85,7 +85,7 @@ def test_every_fault_has_its_words_and_leaves_traces():
     for mode in ("fed", "unfed"):
         table = signatures.known_signatures(mode)
         assert set(table.faults) == {(fault.what, fault.where) for fault in FAULTS}
-        assert all(any(trace.wrong_in for trace in known.values()) for known in table.faults.values())
+        assert all(any(trace.check_step for trace in known.values()) for known in table.faults.values())
 
 
 SMOOTH = [

@@ -11,9 +11,9 @@ from minisplat_ref.reference.pinhole import (
     pinhole_jacobians_vjp,
     pinhole_rays,
     pinhole_vjp,
-    points_at,
     project_into_image,
     slope_limits,
+    unproject_depth,
 )
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import REFERENCE
@@ -459,7 +459,7 @@ def test_points_of_depths_are_seen_where_they_came_from():
     camera = turned_camera()
     depth = 2 + np.random.default_rng(0).uniform(size=(camera.height, camera.width))
     depth[3, 5] = 0
-    points = points_at(depth, camera)
+    points = unproject_depth(depth, camera)
     rows, xy, z = project_into_image(points, camera)
     y, x = np.nonzero(depth)
     assert len(rows) == len(points) == camera.height * camera.width - 1

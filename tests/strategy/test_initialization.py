@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.strategy import initialization
-from minisplat_ref.strategy.initialization import are_seen, from_points, initial_gaussians, random_points
+from minisplat_ref.strategy.initialization import are_seen, gaussians_from_points, initial_gaussians, random_points
 from minisplat_ref.types import Optics, Scene, View
 from scenes import make_camera
 from tolerances import ROUNDED_TO_FLOAT32
@@ -26,26 +26,26 @@ def make_scene(points, cameras):
 
 def test_scale_is_the_root_mean_square_distance():
     """Corner of a unit square: distances 1, 1, sqrt 2, so sqrt(4 / 3) = 1.155; the mean distance would be 1.138."""
-    gaussians = from_points(SQUARE, GREY, 3)
+    gaussians = gaussians_from_points(SQUARE, GREY, 3)
     assert_allclose(np.exp(gaussians.log_scales), np.sqrt(4 / 3), rtol=ROUNDED_TO_FLOAT32)
 
 
 def test_only_the_three_nearest_count():
     far = np.array([[100.0, 0, 0]])
-    gaussians = from_points(np.concatenate([SQUARE, far]), np.zeros((5, 3), np.uint8), 0)
+    gaussians = gaussians_from_points(np.concatenate([SQUARE, far]), np.zeros((5, 3), np.uint8), 0)
     assert_allclose(np.exp(gaussians.log_scales[:4]), np.sqrt(4 / 3), rtol=ROUNDED_TO_FLOAT32)
     assert gaussians.log_scales[4, 0] > np.log(98)
 
 
 def test_points_in_one_place_get_the_least_scale():
-    gaussians = from_points(np.ones((5, 3)), np.zeros((5, 3), np.uint8), 0)
+    gaussians = gaussians_from_points(np.ones((5, 3)), np.zeros((5, 3), np.uint8), 0)
     assert_allclose(gaussians.log_scales, 0.5 * np.log(1e-7), rtol=ROUNDED_TO_FLOAT32)
 
 
 @pytest.mark.parametrize(("degree", "n_rest"), [(0, 0), (1, 3), (3, 15)])
 def test_other_parameters(degree, n_rest):
     colors = np.arange(12, dtype=np.uint8).reshape(4, 3) * 20
-    gaussians = from_points(SQUARE, colors, degree)
+    gaussians = gaussians_from_points(SQUARE, colors, degree)
     assert_array_equal(gaussians.means, SQUARE)
     assert_array_equal(gaussians.quats, [[1, 0, 0, 0]] * 4)
     assert_allclose(1 / (1 + np.exp(-gaussians.opacity_logits)), 0.1, rtol=ROUNDED_TO_FLOAT32)
@@ -56,7 +56,7 @@ def test_other_parameters(degree, n_rest):
 
 def test_too_few_points_are_refused():
     with pytest.raises(InputError, match="points has 3 rows"):
-        from_points(SQUARE[:3], GREY[:3], 3)
+        gaussians_from_points(SQUARE[:3], GREY[:3], 3)
 
 
 def test_random_points_are_inside_the_cube_and_seen(rng):

@@ -9,7 +9,7 @@ from minisplat_ref.strategy.plane_sweep import (
     DepthMap,
     GrayView,
     are_confirmed,
-    rays_between,
+    relative_rays,
     surface_points,
     sweep_planes,
     warp,
@@ -47,7 +47,7 @@ def test_a_neighbour_is_warped_onto_the_plane(cameras):
     """At the depth of the plane both photographs agree, up to bilinear interpolation; at another they do not."""
     view, *others = map(photograph, cameras)
     for other in others:
-        rays = rays_between(view.camera, other.camera)
+        rays = relative_rays(view.camera, other.camera)
         seen, is_inside = warp(rays, other, 1 / DEPTH)
         assert 0.5 < is_inside.mean() < 1
         assert np.abs(seen - view.gray)[is_inside].max() < 0.03
@@ -58,7 +58,7 @@ def test_a_shift_moves_by_the_disparity(cameras):
     """A camera 0.5 to the right sees a point at depth 4 further left by f b / d = 50 x 0.5 / 4 = 6.25 pixels."""
     first, moved, _ = cameras
     ramp = GrayView(moved, np.tile(np.arange(48, dtype=np.float32), (36, 1)))
-    seen, is_inside = warp(rays_between(first, moved), ramp, 1 / DEPTH)
+    seen, is_inside = warp(relative_rays(first, moved), ramp, 1 / DEPTH)
     np.testing.assert_allclose(seen[10, 20], 20 - 6.25, atol=1e-4)
     assert not is_inside[:, :8].any() and is_inside[2:-2, 9:-2].all()  # half a window more
 

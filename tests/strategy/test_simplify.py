@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import (
     by_merging,
@@ -310,7 +310,7 @@ def test_no_mass_to_carry():
 
 def test_reinitialised_is_as_at_the_start(rng):
     points, colors = rng.normal(size=(50, 3)).astype(np.float32), rng.integers(0, 256, (50, 3), np.uint8)
-    start = from_points(points, colors, 3)
+    start = gaussians_from_points(points, colors, 3)
     trained = as_dtype(make_gaussians(rng, 50), np.float32)._replace(means=start.means, sh_dc=start.sh_dc)
     for field, expected in zip(reinitialise(trained, 3), start, strict=True):
         assert field.dtype == np.float32

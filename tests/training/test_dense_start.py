@@ -14,7 +14,7 @@ from minisplat_ref.training.dense_start import (
     choose_spread,
     densify_points,
     have_company,
-    lie_before,
+    is_before_sparse,
 )
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.recipe_settings import configure
@@ -103,8 +103,8 @@ def test_points_before_sparse_ones_by_hand():
     view = view_from(camera)._replace(point_ids=np.array([0]))
     sparse = np.array([[0.0, 0, 4], [0.3, 0, 4]])  # the view shows only the first
     points = np.array([[0, 0, 3.5], [0, 0, 3.7], [0.9 / 144, 0, 1], [1.1 / 144, 0, 1], [0.3 / 2, 0, 2], [0, 0, 9]])
-    assert list(lie_before(points, [view], sparse)) == [True, False, True, False, False, False]
-    assert not lie_before(points, [view._replace(point_ids=None)], sparse).any()
+    assert list(is_before_sparse(points, [view], sparse)) == [True, False, True, False, False, False]
+    assert not is_before_sparse(points, [view._replace(point_ids=None)], sparse).any()
 
 
 def test_neighbours_by_hand():

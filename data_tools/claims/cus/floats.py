@@ -176,7 +176,7 @@ def counts(model: Model) -> dict[str, int]:
     g = model.gaussians
     n_children = g.n_children if isinstance(g, Anchors) else 1
     fixed = FIXED_FLOATS if isinstance(g, Anchors) else 0
-    floats = len(g.means) * (kit.floats_of(g) - fixed) + sum(array.size for array in model.shared.values())
+    floats = len(g.means) * (kit.count_floats(g) - fixed) + sum(array.size for array in model.shared.values())
     return {"gaussians": len(g.means) * n_children, "all_floats": floats}
 
 

@@ -78,7 +78,7 @@ def refit_rows(
     without_view = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
     forms: dict[str, Any] = {"splats": gaussians, "splats, degree 0": without_view}
     told("splats, trained on")
-    recipe = kit.without_events(scale_recipe(GS_ACCEL, iterations))
+    recipe = kit.drop_events(scale_recipe(GS_ACCEL, iterations))
     forms["splats, trained on"] = kit.fine_tune(gaussians, scene, recipe, seed)
     forms["splats, degree 0, trained on"] = kit.fine_tune(without_view, scene, recipe, seed)
     photographs = [view.image / 255 for view in judge.views]

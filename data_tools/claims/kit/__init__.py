@@ -29,9 +29,9 @@ from minisplat_ref.interface.progress import with_progress as with_progress  # w
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io import load_ply, viewpoints
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.training.fine_tuning import drop_events as drop_events
 from minisplat_ref.training.fine_tuning import fine_tune as fine_tune
-from minisplat_ref.training.fine_tuning import without_events as without_events
-from minisplat_ref.training.representation import floats_of as floats_of
+from minisplat_ref.training.representation import count_floats as count_floats
 from minisplat_ref.types import NOTHING, Camera, Floats, Gaussians, Scene
 
 if TYPE_CHECKING:

@@ -53,7 +53,7 @@ def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]
     plain = GS_ACCEL._replace(events=())
     whole = initial_gaussians(scene, plain.sh_degree, np.random.default_rng(0))
     groups = MIXED_GAUSSIANS.extend(whole, np.random.default_rng(0))
-    n_equal = len(groups.means) * kit.floats_of(groups) // kit.floats_of(whole)
+    n_equal = len(groups.means) * kit.count_floats(groups) // kit.count_floats(whole)
     order = np.random.default_rng(0).permutation(len(scene.points))
     fewer = np.sort(order[: min(n_equal, len(order))])
     part = scene._replace(points=scene.points[fewer], point_colors=scene.point_colors[fewer])
@@ -76,7 +76,7 @@ def train_and_measure(recipe: Recipe, scene: Scene, iterations: int, n_seeds: in
         row["psnr"].append(found.psnr)
         row["ssim"].append(found.ssim)
     g = state.gaussians
-    row["number"], row["n_floats"] = len(g.means), len(g.means) * kit.floats_of(g)
+    row["number"], row["n_floats"] = len(g.means), len(g.means) * kit.count_floats(g)
     kinds = np.bincount(counts(g), minlength=4)[1:].tolist() if isinstance(g, MixedGaussians) else [len(g.means), 0, 0]
     return {**row, "kinds": kinds}
 

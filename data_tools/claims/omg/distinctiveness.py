@@ -72,7 +72,7 @@ def measure(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[
     stats = collect_importance(whole, scene.train_views)
     importance = intersection_preserving(indoor(stats), stats.dominant_count)  # [N]
     distinctiveness = local_distinctiveness(whole.means, whole.sh_dc)
-    recipe = kit.without_events(get_recipe(FINE_TUNING, iterations))
+    recipe = kit.drop_events(get_recipe(FINE_TUNING, iterations))
     tuned = kit.fine_tune(whole, scene, recipe, seed)
     rows = [_row("all", "", quality(whole, scene), tuned, scene)]
     jobs = [(fraction, choice) for fraction in FRACTIONS for choice in CHOICES]

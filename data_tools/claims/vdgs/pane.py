@@ -118,12 +118,12 @@ def arms(iterations: int) -> dict[str, Recipe]:
         TIMES: ours,
         PLUS: configure(ours, modulation=modes.opacity_plus),
     }
-    return {name: kit.without_events(scale_recipe(recipe, iterations)) for name, recipe in recipes.items()}
+    return {name: kit.drop_events(scale_recipe(recipe, iterations)) for name, recipe in recipes.items()}
 
 
 def floats_of(model: Model) -> int:
     """Return the floats of a model: those of the Gaussians, and of what is shared."""
-    return len(model.gaussians.means) * kit.floats_of(model.gaussians) + sum(a.size for a in model.shared.values())
+    return len(model.gaussians.means) * kit.count_floats(model.gaussians) + sum(a.size for a in model.shared.values())
 
 
 def pane_opacities(model: Model, recipe: Recipe, camera: Camera) -> Floats:

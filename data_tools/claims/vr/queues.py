@@ -27,7 +27,7 @@ from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
 from minisplat_ref.mechanisms.tangent.planes import TangentFootprints
 from minisplat_ref.mechanisms.tangent.rays import count_misordered
 from minisplat_ref.mechanisms.tangent.renderer import RESPONSE, Prepared
-from minisplat_ref.reference.hits import TileHits, goes_on, tile_hits
+from minisplat_ref.reference.hits import TileHits, is_accepted, tile_hits
 from minisplat_ref.types import Bools, Floats, Ints
 
 
@@ -192,5 +192,5 @@ def _count(rays: Rays, orders: list[Ints]) -> tuple[int, int]:
 def _weights(alphas: Floats, conventions: Conventions) -> Floats:
     """Return the weights of hits in their order, 0 from the one on that the stop threshold leaves out."""
     after = np.cumprod(1 - alphas)
-    weights: Floats = np.where(goes_on(after, conventions), alphas * np.append(1, after)[:-1], 0)
+    weights: Floats = np.where(is_accepted(after, conventions), alphas * np.append(1, after)[:-1], 0)
     return weights

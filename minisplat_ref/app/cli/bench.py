@@ -119,12 +119,12 @@ def _measure(args: argparse.Namespace) -> "Report":
 def _benchmark(args: argparse.Namespace) -> "Report":
     from minisplat_ref.bench.benchmark import benchmark
     from minisplat_ref.bench.contenders import choose
-    from minisplat_ref.bench.peers import peers_of
-    from minisplat_ref.bench.training_time import against_opensplat
+    from minisplat_ref.bench.peers import make_peers
+    from minisplat_ref.bench.training_time import compare_opensplat
     from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
 
-    peers, opensplat = peers_of(args.against)
+    peers, opensplat = make_peers(args.against)
     if opensplat is not None and args.scene is None:
         raise InputError("opensplat trains on photographs: give a scene with --scene")
     contenders = [*choose(args.backends), *peers]
@@ -132,7 +132,7 @@ def _benchmark(args: argparse.Namespace) -> "Report":
     workloads = [get_workload(workload, args.data) for workload in names]  # before the first one takes its time
     cases = [case for workload in workloads for case in benchmark(workload, contenders, args.repeats, progress)]
     if opensplat is not None:
-        cases += against_opensplat(opensplat, args.scene, args.downscale, args.iterations)
+        cases += compare_opensplat(opensplat, args.scene, args.downscale, args.iterations)
     if args.data is None and args.workloads is None:
         progress("garden, garden20k: skipped; minisplat-ref data garden fetches their points, for --data data/garden")
     title = "Speed against error: every time beside its error against the float64 reference"

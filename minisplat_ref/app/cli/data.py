@@ -48,10 +48,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _fetch(name: str, out: Path) -> int:
     from minisplat_ref.app.reports.commands import command
-    from minisplat_ref.datasets.catalogue import files_of, find
+    from minisplat_ref.datasets.catalogue import find, scene_files
     from minisplat_ref.datasets.fetching import fetch
 
-    data_set, files = find(name), files_of(name)
+    data_set, files = find(name), scene_files(name)
     n_fetched = fetch(files, out, name)
     there = f", {len(files) - n_fetched} were there" if n_fetched < len(files) else ""
     print(f"{out}: {n_fetched} files fetched{there}; all {len(files)} have the right hash")
@@ -62,11 +62,11 @@ def _fetch(name: str, out: Path) -> int:
 
 
 def _list() -> None:
-    from minisplat_ref.datasets.catalogue import CATALOGUE, files_of
+    from minisplat_ref.datasets.catalogue import CATALOGUE, scene_files
 
     indent = " " * 16
     for name, data_set in CATALOGUE.items():
-        megabytes = sum(file.n_bytes for file in files_of(name)) / 1e6
+        megabytes = sum(file.n_bytes for file in scene_files(name)) / 1e6
         print(f"{name:<16}{data_set.what}, {megabytes:,.1f} MB")
         print(f"{indent}licence: {data_set.licence}")
         print(f"{indent}{data_set.page}")

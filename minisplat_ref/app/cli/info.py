@@ -125,7 +125,7 @@ def _checkpoint_rows(path: Path) -> Rows:
     from minisplat_ref.io.checkpoint import load_checkpoint
     from minisplat_ref.io.frames import return_fields
     from minisplat_ref.training.representation import WORLD_UNITS
-    from minisplat_ref.training.saved_state import check_fields, read_counters, read_frame, written_by
+    from minisplat_ref.training.saved_state import check_fields, read_counters, read_frame, recorded_recipe
 
     arrays, metadata = load_checkpoint(path)
     fields = _group(arrays, "gaussians")
@@ -133,7 +133,7 @@ def _checkpoint_rows(path: Path) -> Rows:
     fields = return_fields(fields, WORLD_UNITS, read_frame(path, metadata))
     rows = [
         ("iteration", f"{read_counters(path, metadata).step:,}"),
-        ("recipe", "{} for {} iterations".format(*written_by(metadata))),
+        ("recipe", "{} for {} iterations".format(*recorded_recipe(metadata))),
         *_field_rows(fields),
     ]
     shared = ", ".join(f"{name} {_shape(array)}" for name, array in _group(arrays, "shared").items())

@@ -15,9 +15,9 @@ from minisplat_ref.interface.arguments import (
     add_renderer_arguments,
     add_worker_arguments,
     color,
+    drop_workers,
     integer,
     positive,
-    without_workers,
 )
 from minisplat_ref.interface.progress import with_progress
 
@@ -173,7 +173,7 @@ def _hand_out(workers: "Workers", args: argparse.Namespace, out: Path, names: Se
     from minisplat_ref.app.runs.cluster import carry_out_all
     from minisplat_ref.app.runs.worker import Job
 
-    words = [*without_workers(args.words), "--out", str(out)]
+    words = [*drop_workers(args.words), "--out", str(out)]
     parts = [f"{start}:{min(start + PART, len(names))}" for start in range(0, len(names), PART)]
     jobs = [Job(f"images {part}", _words_of_part, (words, part)) for part in parts]
     inputs = [path for path in (args.input, args.environment) if path is not None]

@@ -92,12 +92,12 @@ def _of_checkpoint(path: Path) -> Source:
     """Read a checkpoint without its run: the population is that of its recipe, which an extension may own."""
     from minisplat_ref.app.runs.settings import return_model
     from minisplat_ref.io.checkpoint import load_checkpoint
-    from minisplat_ref.training.saved_state import read_bundles, read_counters, read_frame, written_by
+    from minisplat_ref.training.saved_state import read_bundles, read_counters, read_frame, recorded_recipe
 
     arrays, metadata = load_checkpoint(path)
     step = read_counters(path, metadata).step
     fields = {name.removeprefix("gaussians.") for name in arrays if name.startswith("gaussians.")}
-    owner = CORE if fields == set(Gaussians._fields) else owner_of(written_by(metadata)[0]) or CORE
+    owner = CORE if fields == set(Gaussians._fields) else owner_of(recorded_recipe(metadata)[0]) or CORE
     bundles = read_bundles(path, arrays, owner.representation.population)
     model, frame = Model(bundles.gaussians, bundles.shared), read_frame(path, metadata)
     label = label_for(owner, model.shared, {})

@@ -30,7 +30,7 @@ from minisplat_ref.rendering.backends import get_backend
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import last_step, train
-from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
+from minisplat_ref.training.pace import COOLED, FINER, Decision, pace_to_json
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Scene
@@ -196,7 +196,7 @@ def _save(training: Training) -> bool:
             checkpoints.save(folder, state, recipe)
             save_model(folder, settings, state.model, state.frame)
             if recipe.cooling is not None:
-                run_folder.write_json(folder / run_folder.DECISIONS, to_metadata(state.pace))
+                run_folder.write_json(folder / run_folder.DECISIONS, pace_to_json(state.pace))
     except KeyboardInterrupt:
         return False
     return True

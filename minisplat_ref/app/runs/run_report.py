@@ -22,7 +22,7 @@ from minisplat_ref.interface.palette import PURPLE
 from minisplat_ref.io import read_image
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.names import file_names
-from minisplat_ref.training.pace import from_metadata
+from minisplat_ref.training.pace import pace_from_json
 from minisplat_ref.types import Scene
 
 N_SHOWN = 6  # test views with images; all are in the table
@@ -75,7 +75,7 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
         )
         sections.append(section("Trained in blocks", paragraph(BLOCKS_TEXT), plan))
     if (folder / run_folder.DECISIONS).exists():
-        pace = from_metadata(run_folder.read_json_object(folder / run_folder.DECISIONS))
+        pace = pace_from_json(run_folder.read_json_object(folder / run_folder.DECISIONS))
         sections.append(decisions_section(pace, n_iterations))
     if log:
         sections.append(section("How the training went", _curves(folder, log)))

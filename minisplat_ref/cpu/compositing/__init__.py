@@ -13,7 +13,7 @@ from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.forward import HitStats, forward_kernel
 from minisplat_ref.cpu.compositing.pair_sums import N_PAIR_STATS, slot_size, sum_pair_stats, sum_slots
 from minisplat_ref.cpu.compositing.records import records_of
-from minisplat_ref.cpu.compositing.tile_state import Pixels, frame_of, lists_of
+from minisplat_ref.cpu.compositing.tile_state import Pixels, pack_frame, pack_lists
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.jit.compile import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
@@ -72,9 +72,9 @@ def composite_with(
         records,
         projection.depths,
         background,
-        lists_of(bins),
+        pack_lists(bins),
         n_threads(),
-        frame_of(bins, conventions, dtype),
+        pack_frame(bins, conventions, dtype),
         Pixels(image.reshape(height * width, image.shape[2]), alpha.reshape(-1)),
         HitStats(slots, median_depth, dominant_ids),
     )
@@ -105,9 +105,9 @@ def composite_vjp_with(
     v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
         output.saved if output.saved is not None else records_of(projection, colors, conventions),
-        lists_of(bins),
+        pack_lists(bins),
         n_threads(),
-        frame_of(bins, conventions, dtype),
+        pack_frame(bins, conventions, dtype),
         Pixels(output.image.reshape(n_pixels, n_channels), output.alpha.ravel()),
         Pixels(v_image.reshape(n_pixels, n_channels), v_alpha.ravel()),
         slots,

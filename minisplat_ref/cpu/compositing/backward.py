@@ -30,22 +30,22 @@ from minisplat_ref.cpu.compositing.tile_rows import (
     SCRATCH_SIZE,
     alpha_writer,
     find_reached_rows,
+    mean_offset_y,
+    ridge_offsets,
     start_scratch,
-    to_mean_y,
-    to_ridge,
 )
 from minisplat_ref.cpu.compositing.tile_state import (
     CHECK_EVERY,
     N_ROWS,
     Tile,
     corner,
+    marked_rows,
     open_rows,
     row_in_image,
-    rows_of,
     start_tile,
     take_tiles,
 )
-from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.cpu.gaussian_rows import eight_rows
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, load, reduce_sum, reduce_sums, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
@@ -71,7 +71,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             if n_pixels == 0:
                 continue  # as start_tile left it
             first = y * frame.width + x
-            rows, is_inside = rows_from(first, first + n_pixels), iota(as_data(0)) < as_data(n_pixels)
+            rows, is_inside = eight_rows(first, first + n_pixels), iota(as_data(0)) < as_data(n_pixels)
             behind = gather(v_alpha, rows, 0) * (gather(alpha, rows, 0) - ONE)  # alpha = 1 - T_final
             place = row * row_size
             for k in range(n_channels):
@@ -114,10 +114,10 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             red, green, blue = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
             q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
             further[:] = ZERO
-            for row in rows_of(rows):
+            for row in marked_rows(rows):
                 i = row * row_size
                 unclamped = load(scratch, ALPHAS + row * WIDTH)
-                e, dy = to_ridge(scratch, row), to_mean_y(scratch, row)
+                e, dy = ridge_offsets(scratch, row), mean_offset_y(scratch, row)
                 transmittance = load(s, i)
                 after, weight = blend(transmittance, unclamped, frame)
                 store(s, i, after)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import exp_of, ldexp, maximum, rint
+from minisplat_ref.jit.lanes import ldexp, libm_exp, maximum, rint
 
 _LOG2_E = np.float32(math.log2(math.e))
 _SMALLEST = np.float32(-60.0)  # far below any visible alpha, far above denormals, which cost tens of cycles
@@ -28,7 +28,7 @@ _C0, _C1, _C2, _C3, _C4, _C5 = (
 @scalar
 def exp_exact(x):
     """Return libm's exp."""
-    return exp_of(x)
+    return libm_exp(x)
 
 
 @scalar

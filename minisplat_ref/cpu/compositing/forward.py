@@ -21,13 +21,13 @@ from minisplat_ref.cpu.compositing.tile_state import (
     N_ROWS,
     Tile,
     corner,
+    marked_rows,
     open_rows,
     row_in_image,
-    rows_of,
     start_tile,
     take_tiles,
 )
-from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.cpu.gaussian_rows import eight_rows
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
@@ -81,9 +81,9 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         store(s, i + crossing, select(is_crossing, depth, load(s, i + crossing)))
 
     @scalar
-    def pixels_of(state, place, n_pixels):
+    def load_pixels(state, place, n_pixels):
         """Load a field of a row; where the image ends within the row, its last pixel is repeated."""
-        return load(state, place) if n_pixels == WIDTH else gather(state, rows_from(place, place + n_pixels), 0)
+        return load(state, place) if n_pixels == WIDTH else gather(state, eight_rows(place, place + n_pixels), 0)
 
     @scalar
     def store_tile(state, x0, y0, background, frame, image, alpha):
@@ -92,11 +92,11 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
             if n_pixels == 0:
                 continue
             first, place = y * frame.width + x, row * row_size
-            rows = rows_from(first, first + n_pixels)
-            left = abs(pixels_of(state, place, n_pixels))
+            rows = eight_rows(first, first + n_pixels)
+            left = abs(load_pixels(state, place, n_pixels))
             scatter(alpha, rows, 0, ONE - left)
             for k in range(n_channels):
-                color = pixels_of(state, place + channels + k * WIDTH, n_pixels)
+                color = load_pixels(state, place + channels + k * WIDTH, n_pixels)
                 scatter(image, rows, k, color + left * background[k])
 
     @scalar
@@ -127,7 +127,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
             write_alphas(scratch, rows, records, n, x0, y0)
             fused = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
             total = largest = hits = zero
-            for row in rows_of(rows):
+            for row in marked_rows(rows):
                 i = row * row_size
                 after, weight = blend(load(s, i), load(scratch, ALPHAS + row * WIDTH), frame)
                 store(s, i, after)

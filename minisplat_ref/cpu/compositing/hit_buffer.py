@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.cpu.gaussian_rows import eight_rows
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, reduce_any, scatter, select, store
 from minisplat_ref.jit.literals import ZERO
@@ -45,7 +45,7 @@ def hit_buffer(n, n_channels, as_data):
 @scalar
 def hit_rows(h):
     """Return the eight rows of hit ``h``."""
-    return rows_from(h * WIDTH, (h + 1) * WIDTH)
+    return eight_rows(h * WIDTH, (h + 1) * WIDTH)
 
 
 @scalar

@@ -16,7 +16,7 @@ from minisplat_ref.cpu.compositing.plain_statistics import (
     statistics_kernel,
 )
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import pack_frame
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.types import BlendGradient, BlendStats, Floats, Ints, RenderOutput, TileBins
 
@@ -48,7 +48,7 @@ def composite_hits(
     height, width, dtype, n_channels = bins.grid.height, bins.grid.width, colors.dtype, len(background)
     image, alpha = np.empty((height, width, n_channels), dtype), np.empty((height, width), dtype)
     records = _bundle(response, primitives, colors)
-    lists, frame = lists_of(bins, response), frame_of(bins, conventions, dtype)
+    lists, frame = pack_lists(bins, response), pack_frame(bins, conventions, dtype)
     forward_kernel(_find_shared(response), n_channels)(
         records, background, lists, frame, n_threads(), _pixels(image, alpha, dtype)
     )
@@ -92,8 +92,8 @@ def composite_hits_vjp(
     v_backgrounds = np.zeros((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(_find_shared(response), n_channels)(
         _bundle(response, primitives, colors),
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins, response),
+        pack_frame(bins, conventions, dtype),
         n_threads(),
         _pixels(output.image, output.alpha, dtype),
         _pixels(*v_output, dtype),
@@ -122,8 +122,8 @@ def removal_changes_of_hits(
     changes = np.zeros(len(bins.gaussian_ids), dtype)
     removal_kernel(_find_shared(response), n_channels)(
         _bundle(response, primitives, colors),
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins, response),
+        pack_frame(bins, conventions, dtype),
         n_threads(),
         np.ascontiguousarray(output.image, dtype).reshape(-1, n_channels),
         changes,
@@ -133,7 +133,7 @@ def removal_changes_of_hits(
     return totals
 
 
-def lists_of(bins: TileBins, response: KernelResponse) -> Lists:
+def pack_lists(bins: TileBins, response: KernelResponse) -> Lists:
     """Return the lists of the tiles in the form that plain kernels take."""
     size = bins.grid.tile_width, bins.grid.tile_height
     return Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots, *size, response.buffer_size)

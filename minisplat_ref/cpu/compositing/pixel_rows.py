@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.cpu.gaussian_rows import eight_rows
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, load, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -98,13 +98,13 @@ def row_of_tile(i, tile, members, counts, lists, frame):
 def row_pixels(row, frame):
     """Return the flat indices of a row's pixels in the image; those beyond its edge repeat the last."""
     first = row.y * frame.width + row.x
-    return rows_from(first, first + min(WIDTH, frame.width - row.x))
+    return eight_rows(first, first + min(WIDTH, frame.width - row.x))
 
 
 @scalar
-def field_of(state, k, row, frame):
+def load_field(state, k, row, frame):
     """Return field k of ``state`` [n_fields * 8]; pixels beyond the image's edge repeat the last."""
-    return gather(state, rows_from(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - row.x)), 0)
+    return gather(state, eight_rows(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - row.x)), 0)
 
 
 @scalar

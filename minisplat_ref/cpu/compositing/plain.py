@@ -35,9 +35,9 @@ import numpy as np
 from minisplat_ref.constants import LIST_ORDER
 from minisplat_ref.cpu.compositing.hit_buffer import ALPHA, CHANNELS, V_ALPHA, WEIGHT, hit_buffer, hit_rows, walk_sorted
 from minisplat_ref.cpu.compositing.pixel_rows import (
-    field_of,
     full_transmittance,
     list_rows,
+    load_field,
     row_of_tile,
     row_pixels,
 )
@@ -109,10 +109,10 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                         composite_sorted_row(state, buffer, primitives, row, lists.buffer_size, frame)
                     else:
                         composite_row(state, primitives, row, frame)
-                    pixels, T_end = row_pixels(row, frame), abs(field_of(state, 0, row, frame))
+                    pixels, T_end = row_pixels(row, frame), abs(load_field(state, 0, row, frame))
                     scatter(out.alpha, pixels, 0, ONE - T_end)
                     for k in range(n_channels):
-                        scatter(out.image, pixels, k, field_of(state, 1 + k, row, frame) + T_end * background[k])
+                        scatter(out.image, pixels, k, load_field(state, 1 + k, row, frame) + T_end * background[k])
 
     return composite_tiles
 

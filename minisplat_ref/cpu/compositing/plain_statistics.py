@@ -18,9 +18,9 @@ import numpy as np
 from minisplat_ref.constants import LIST_ORDER, MEDIAN_TRANSMITTANCE
 from minisplat_ref.cpu.compositing.hit_buffer import ALPHA, CHANNELS, V_ALPHA, WEIGHT, hit_buffer, hit_rows, walk_sorted
 from minisplat_ref.cpu.compositing.pixel_rows import (
-    field_of,
     full_transmittance,
     list_rows,
+    load_field,
     row_of_tile,
     row_pixels,
 )
@@ -91,7 +91,7 @@ def statistics_kernel(response: KernelResponse) -> Callable:
             if not reduce_any(load(state, 0) > ZERO):
                 break
 
-    walk = walk_sorted(response._replace(hit=with_depth(hit), shade=depth_of), 1, _take(blend_one))
+    walk = walk_sorted(response._replace(hit=with_depth(hit), shade=hit_depth), 1, _take(blend_one))
 
     @scalar
     def count_sorted_row(pairs, buffer, state, primitives, row, buffer_size, frame):
@@ -120,7 +120,7 @@ def statistics_kernel(response: KernelResponse) -> Callable:
                         count_sorted_row(pairs[first:], buffer, state, primitives, row, lists.buffer_size, frame)
                     else:
                         count_row(pairs[first:], state, primitives, row, frame)
-                    scatter(median_depth, row_pixels(row, frame), 0, field_of(state, MEDIAN, row, frame))
+                    scatter(median_depth, row_pixels(row, frame), 0, load_field(state, MEDIAN, row, frame))
                     for k in range(min(WIDTH, frame.width - row.x)):
                         if state[LARGEST * WIDTH + k] > ZERO:
                             pixel = row.y * frame.width + row.x + k
@@ -130,7 +130,7 @@ def statistics_kernel(response: KernelResponse) -> Callable:
 
 
 def with_depth(hit: Callable) -> Callable:
-    """Return a response's ``hit`` whose place is the depth alone, which :func:`depth_of` reads."""
+    """Return a response's ``hit`` whose place is the depth alone, which :func:`hit_depth` reads."""
 
     @scalar
     def hit_with_depth(records, n, x, y):
@@ -141,7 +141,7 @@ def with_depth(hit: Callable) -> Callable:
 
 
 @scalar
-def depth_of(colors, n, k, place):
+def hit_depth(colors, n, k, place):
     """Return the depth of a hit in the place of a channel."""
     return place[0]
 
@@ -173,7 +173,7 @@ def removal_kernel(response: KernelResponse, n_channels: int) -> Callable:
         return weight, odds(weight, unclamped, frame)
 
     @scalar
-    def change_of(state, k, light, hit_odds):
+    def channel_change(state, k, light, hit_odds):
         """Return the squared change of channel k in each pixel without the current hit."""
         behind = load(state, BEHIND + k * WIDTH) - light
         store(state, BEHIND + k * WIDTH, behind)
@@ -189,7 +189,7 @@ def removal_kernel(response: KernelResponse, n_channels: int) -> Callable:
             weight, hit_odds = blend_one(state, unclamped, frame)
             total = broadcast(state.dtype.type(0))
             for k in range(n_channels):
-                total = total + change_of(state, k, weight * shade(primitives.colors, n, k, place), hit_odds)
+                total = total + channel_change(state, k, weight * shade(primitives.colors, n, k, place), hit_odds)
             changes[m] += reduce_sum(total)
             if not reduce_any(load(state, 0) > ZERO):
                 break
@@ -200,7 +200,7 @@ def removal_kernel(response: KernelResponse, n_channels: int) -> Callable:
         weight, hit_odds = blend_one(state, gather(hits, rows, ALPHA), frame)
         total = broadcast(state.dtype.type(0))
         for k in range(n_channels):
-            total = total + change_of(state, k, weight * gather(hits, rows, CHANNELS + k), hit_odds)
+            total = total + channel_change(state, k, weight * gather(hits, rows, CHANNELS + k), hit_odds)
         scatter(hits, rows, V_ALPHA, total)
 
     walk = walk_sorted(response, n_channels, take)

@@ -13,7 +13,7 @@ from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, cast, gather, minimum, scatter
-from minisplat_ref.scalar.compositing import HALF_FACTOR_MAX, factors, half_of
+from minisplat_ref.scalar.compositing import HALF_FACTOR_MAX, factors, halve_factor
 from minisplat_ref.scalar.tiling import Outline, visible_outline
 from minisplat_ref.types import Floats, Projection
 
@@ -39,7 +39,7 @@ def _write_eight(rows, projection, colors, alpha_min, records):
     means2d, boxes = projection.means2d, projection.boxes
     first_half = (
         *(gather(means2d, rows, 0), gather(means2d, rows, 1)),
-        *round_lanes((half_of(a_factor), slope, half_of(pivot)), zero),
+        *round_lanes((halve_factor(a_factor), slope, halve_factor(pivot)), zero),
         *(opacity, outline.slope, outline.inverse_a),
     )
     second_half = (

@@ -20,7 +20,7 @@ from minisplat_ref.constants import LIST_ORDER
 from minisplat_ref.cpu.compositing.pixel_rows import hit_ray_row, hit_row
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.literals import TWO
-from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors, half_of, mahalanobis
+from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors, halve_factor, mahalanobis
 from minisplat_ref.types import Floats, Ints, Projection
 
 
@@ -123,7 +123,7 @@ def _conic_records(projection: Projection, dtype: np.dtype) -> Floats:
     records = np.empty((len(a), DEPTH + 1), dtype)
     records[:, MEAN_X], records[:, MEAN_Y] = projection.means2d.T
     # Rounding can make a factor negative: then only the pixel at the centre is hit.
-    records[:, HALF_A], records[:, HALF_PIVOT] = half_of(a), half_of(pivot)
+    records[:, HALF_A], records[:, HALF_PIVOT] = halve_factor(a), halve_factor(pivot)
     records[:, SLOPE], records[:, OPACITY], records[:, DEPTH] = slope, projection.opacities, projection.depths
     return records
 

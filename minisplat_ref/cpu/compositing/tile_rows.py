@@ -23,12 +23,11 @@ from minisplat_ref.cpu.compositing.records import (
     SLOPE,
     transpose_outline,
 )
-from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, rows_of
+from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, marked_rows
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN, TILE_HEIGHT
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
-    bits_between,
     broadcast,
     floor,
     iota,
@@ -36,6 +35,7 @@ from minisplat_ref.jit.lanes import (
     maximum,
     minimum,
     prefetch,
+    range_mask,
     select,
     store,
 )
@@ -80,21 +80,21 @@ def write_lines(scratch, mx, my, slope, half_pivot):
 
 
 @scalar
-def to_ridge(scratch, row):
+def ridge_offsets(scratch, row):
     """Return e at the pixel centres of a row."""
     return scratch[RIDGE + row % TILE_HEIGHT] - load(scratch, CENTRES_X + row // TILE_HEIGHT * WIDTH)
 
 
 @scalar
-def to_mean_y(scratch, row):
+def mean_offset_y(scratch, row):
     """Return dy of a row, a single number."""
     return scratch[TO_MEAN_Y + row % TILE_HEIGHT]
 
 
 @scalar
-def sigma_of(scratch, row, half_a):
+def row_sigma(scratch, row, half_a):
     """Return sigma at the pixel centres of a row."""
-    return mahalanobis(to_ridge(scratch, row), half_a, scratch[LEAST + row % TILE_HEIGHT])
+    return mahalanobis(ridge_offsets(scratch, row), half_a, scratch[LEAST + row % TILE_HEIGHT])
 
 
 @scalar
@@ -119,7 +119,7 @@ def find_reached_rows(records, ids, m, x0, y0):
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
     bound = side * maximum(as_data(-TILE_HEIGHT), minimum(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))
-    return bits_between(select(is_in_box, bound, zero))  # no branches, which would be unpredictable
+    return range_mask(select(is_in_box, bound, zero))  # no branches, which would be unpredictable
 
 
 def alpha_writer(exp: Callable) -> Callable:
@@ -131,7 +131,7 @@ def alpha_writer(exp: Callable) -> Callable:
         mx, my = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0)
         write_lines(scratch, mx, my, records[n, SLOPE], records[n, HALF_PIVOT])
         half_a, opacity = records[n, HALF_A], records[n, OPACITY]
-        for row in rows_of(rows):
-            store(scratch, ALPHAS + row * WIDTH, opacity * exp(-sigma_of(scratch, row, half_a)))
+        for row in marked_rows(rows):
+            store(scratch, ALPHAS + row * WIDTH, opacity * exp(-row_sigma(scratch, row, half_a)))
 
     return write_alphas

@@ -59,7 +59,7 @@ class Pixels(NamedTuple):
     """[H * W]."""
 
 
-def lists_of(bins: TileBins) -> TileLists:
+def pack_lists(bins: TileBins) -> TileLists:
     """Return the lists without their grid.
 
     Raises
@@ -75,7 +75,7 @@ def lists_of(bins: TileBins) -> TileLists:
     return TileLists(bins.tile_offsets, bins.gaussian_ids, bins.slots)
 
 
-def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
+def pack_frame(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
     """Return image size and thresholds in the form that kernels take."""
     least = dtype.type(conventions.transmittance_min)
     if conventions.stops_at_equality:
@@ -154,7 +154,7 @@ def open_rows(state, n_fields):
 
 
 @scalar
-def rows_of(bits):
+def marked_rows(bits):
     """Yield the rows of a set, from the first to the last."""
     while bits != np.uint64(0):
         yield lowest_bit(bits)

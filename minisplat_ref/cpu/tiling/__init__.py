@@ -31,7 +31,7 @@ from minisplat_ref.cpu.tiling.layers import (
     start_lists,
     survey_part,
 )
-from minisplat_ref.cpu.tiling.sorting import keys_of
+from minisplat_ref.cpu.tiling.sorting import depth_keys
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
@@ -83,7 +83,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     within one row or one column of tiles is not examined that closely.
     """
     n, n_tiles, dtype = len(projection.depths), grid.n_tiles_x * grid.n_tiles_y, projection.depths.dtype
-    keys = keys_of(projection.depths)
+    keys = depth_keys(projection.depths)
     screen = Screen(grid.n_tiles_x, n_tiles, dtype.type(conventions.alpha_min))
     survey = Survey(
         keys,

@@ -41,7 +41,7 @@ class Survey(NamedTuple):
     """Results of the first pass for each part, and the depths as integers."""
 
     keys: Ints
-    """[N] integers in the order of the depths, :func:`~minisplat_ref.cpu.tiling.sorting.keys_of`."""
+    """[N] integers in the order of the depths, :func:`~minisplat_ref.cpu.tiling.sorting.depth_keys`."""
 
     up_to: Ints
     """[N_PARTS, CULLED + 2] Gaussians of each part below each bucket, and 2^32 times the tiles under their boxes, so
@@ -82,7 +82,7 @@ class Scratch(NamedTuple):
 
 
 @scalar
-def part_of(n, i):
+def part_range(n, i):
     """Return the range [first, end) of part ``i`` of ``n`` elements."""
     return n * i // N_PARTS, n * (i + 1) // N_PARTS
 
@@ -100,7 +100,7 @@ def _bucket(depth, is_visible):
 def survey_part(part, boxes, depths, survey):
     """Count the Gaussians of a part and their tiles, and list those whose boxes are wide."""
     up_to, squares, others = survey.up_to[part], survey.wide[part, SQUARES], survey.wide[part, OTHERS]
-    start, end = part_of(depths.size, part)
+    start, end = part_range(depths.size, part)
     up_to[:] = 0
     n_squares = n_others = 0
     for n in range(start, end):
@@ -164,7 +164,7 @@ def cut_layers(up_to, of_buckets, edges):
 def _write_wide(part, survey, projection, screen, layers, cells, cursors, wide):
     """Write the cells of the wide boxes of a part, eight at a time; ``wide`` gets the first of each and the end."""
     n_tiles_x, n_tiles, alpha_min = screen
-    start, _ = part_of(projection.depths.size, part)
+    start, _ = part_range(projection.depths.size, part)
     spans = np.empty(2 * WIDTH * (n_tiles // n_tiles_x), projection.depths.dtype)
     for kind in (SQUARES, OTHERS):
         ids = survey.wide[part, kind]
@@ -189,7 +189,7 @@ def list_part(part, survey, projection, screen, layers, cells, offsets, counts):
     """Enter each Gaussian of a part into its layer, and count the pairs of each cell."""
     keys, boxes, entries = survey.keys, projection.boxes, layers.entries
     n_tiles_x, n_tiles = screen.n_tiles_x, screen.n_tiles
-    start, end = part_of(keys.size, part)
+    start, end = part_range(keys.size, part)
     cursors, wide = layers.edges[part:-1:N_PARTS].copy(), np.empty((end - start, 2), np.int32)
     _write_wide(part, survey, projection, screen, layers, cells, cursors, wide)
     slot = 0
@@ -246,7 +246,7 @@ def start_lists(counts, offsets, first_slots, tile_offsets):
     slot = 0
     for part in range(N_PARTS):
         first_slots[part] = slot
-        start, end = part_of(offsets.size - 1, part)
+        start, end = part_range(offsets.size - 1, part)
         if end > start:
             slot += offsets[end]
 
@@ -279,7 +279,7 @@ def fill_layer(layer, layers, cells, first_slots, offsets, scratch, starts, list
     places, other_keys, other_places = scratch
     digits = np.empty((2, 1 << DIGIT_BITS), np.int32)
     ids, slots = lists[0], lists[1]
-    start, end = part_of(other_keys.size, layer)
+    start, end = part_range(other_keys.size, layer)
     for i in range(start, end):
         offsets[i + 1] += first_slots[layer]
     for part in range(N_PARTS):

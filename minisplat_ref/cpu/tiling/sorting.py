@@ -1,9 +1,9 @@
 """Sort floats with a radix sort of their bits.
 
 Positive IEEE floats have the same order as the integers with their bits, negative ones the opposite order
-(:func:`keys_of`). Keys are sorted digit by digit in linear passes. Each pass is stable, so equal keys keep their order.
-Keys close to each other share their leading bits: therefore digits are those of the difference to the smallest key,
-and only as many pairs of digits as the largest difference needs are sorted.
+(:func:`depth_keys`). Keys are sorted digit by digit in linear passes. Each pass is stable, so equal keys keep their
+order. Keys close to each other share their leading bits: therefore digits are those of the difference to the smallest
+key, and only as many pairs of digits as the largest difference needs are sorted.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ DIGIT_MASK = (1 << DIGIT_BITS) - 1
 KEY_BITS = 64  # of the longest keys
 
 
-def keys_of(depths: Floats) -> Ints:
+def depth_keys(depths: Floats) -> Ints:
     """Return integers [N] in the order of the depths, their bits as long as none is negative; both zeros are equal."""
     bits: Ints = depths.view(np.int32 if depths.dtype == np.float32 else np.int64)
     if bits.min(initial=0) >= 0:

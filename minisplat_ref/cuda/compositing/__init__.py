@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import pack_frame
 from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host, zeros
 from minisplat_ref.cuda.compositing.backward import backward_kernel
 from minisplat_ref.cuda.compositing.forward import forward_kernel
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS, N_PAIR_STATS, sum_pair_stats, sum_slots
 from minisplat_ref.cuda.compositing.records import records_of
-from minisplat_ref.cuda.compositing.tiles import BLOCK, Pixels, lists_of
+from minisplat_ref.cuda.compositing.tiles import BLOCK, Pixels, pack_lists
 from minisplat_ref.cuda.target import launch, launch_rows
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
@@ -43,8 +43,8 @@ def composite(
         records_of(projection, colors),
         to_device(projection.depths),
         to_device(background),
-        lists_of(bins),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins),
+        pack_frame(bins, conventions, dtype),
         pixels,
         (slots, median_depth, dominant_ids),
     )
@@ -107,8 +107,8 @@ def _vjp(
         n_tiles,
         BLOCK,
         records_of(projection, colors),
-        lists_of(bins),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins),
+        pack_frame(bins, conventions, dtype),
         to_device(Pixels(output.image, output.alpha)),
         to_device(Pixels(_as_dtype(v.image, dtype), _as_dtype(v.alpha, dtype))),
         slots,

@@ -15,7 +15,7 @@ import numpy as np
 
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS
 from minisplat_ref.cuda.compositing.records import COLOR
-from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, pixel_of, read_batch
+from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, read_batch, thread_pixel
 from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, reduce_warps
 from minisplat_ref.jit.lanes import select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -47,7 +47,7 @@ def backward_kernel(dtype: np.dtype, n_channels: int, is_atomic: bool = False) -
         v = cuda.local.array(n_colors, dtype)
         summed = cuda.local.array(n_sums, dtype)
         thread = cuda.threadIdx.x
-        x, y = pixel_of(frame)
+        x, y = thread_pixel(frame)
         is_pixel = x < frame.width and y < frame.height
         center_x, center_y = real(x) + HALF, real(y) + HALF
         T, behind = real(-1), real(0)

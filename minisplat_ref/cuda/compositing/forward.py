@@ -14,7 +14,7 @@ import numpy as np
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cuda.compositing.pair_sums import HIT_COUNT, N_PAIR_STATS, N_PAIR_SUMS, WEIGHT_MAX, WEIGHT_SUM
 from minisplat_ref.cuda.compositing.records import COLOR
-from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, pixel_of, read_batch
+from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, read_batch, thread_pixel
 from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, reduce_warps
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -48,7 +48,7 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
         exchange = cuda.shared.array((n_exchanged, N_PAIR_STATS), dtype)
         color = cuda.local.array(n_colors, dtype)
         values = cuda.local.array(N_PAIR_STATS, dtype)
-        x, y = pixel_of(frame)
+        x, y = thread_pixel(frame)
         is_pixel = x < frame.width and y < frame.height
         center_x, center_y = real(x) + HALF, real(y) + HALF
         T = real(1) if is_pixel else real(-1)

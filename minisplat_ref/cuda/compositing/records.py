@@ -7,7 +7,7 @@ from typing import Any
 
 from minisplat_ref.cuda.arrays import empty, to_device
 from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
-from minisplat_ref.scalar.compositing import factors, half_of
+from minisplat_ref.scalar.compositing import factors, halve_factor
 from minisplat_ref.types import Floats, Projection
 
 # Columns. The conic is stored as its factors, two of them halved as sigma needs them; edges of the box are floats.
@@ -22,7 +22,7 @@ def write_records(projection, colors, records):
         return
     a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
     records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], projection.means2d[n, 1]
-    records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT] = half_of(a), slope, half_of(pivot)
+    records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT] = halve_factor(a), slope, halve_factor(pivot)
     records[n, OPACITY] = projection.opacities[n]
     for i in range(4):
         records[n, X0 + i] = projection.boxes[n, i]

@@ -6,7 +6,7 @@ from minisplat_ref.cuda.arrays import to_device
 from minisplat_ref.cuda.compositing.records import HALF_A, HALF_PIVOT, MEAN_X, MEAN_Y, OPACITY, SLOPE, X0, X1, Y0, Y1
 from minisplat_ref.cuda.target import WARP, cuda, device_function
 from minisplat_ref.cuda.tiling import TILE
-from minisplat_ref.jit.lanes import exp_of, select
+from minisplat_ref.jit.lanes import libm_exp, select
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import mahalanobis
 from minisplat_ref.types import Floats, Ints, TileBins
@@ -27,7 +27,7 @@ class Lists(NamedTuple):
     """[M] slot of each pair."""
 
 
-def lists_of(bins: TileBins) -> Any:
+def pack_lists(bins: TileBins) -> Any:
     """Return the lists on the device."""
     return to_device(Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots))
 
@@ -42,7 +42,7 @@ class Pixels(NamedTuple):
 
 
 @device_function
-def pixel_of(frame):
+def thread_pixel(frame):
     """Return column and line of the thread's pixel, which may lie beyond the image's edge."""
     tile, thread = cuda.blockIdx.x, cuda.threadIdx.x
     n_tiles_x = (frame.width + TILE - 1) // TILE
@@ -68,4 +68,4 @@ def hit(batch, j, center_x, center_y):
     is_inside = (
         (batch[j, X0] < center_x) & (center_x < batch[j, X1]) & (batch[j, Y0] < center_y) & (center_y < batch[j, Y1])
     )
-    return select(is_inside, batch[j, OPACITY] * exp_of(-sigma), ZERO), e, dy
+    return select(is_inside, batch[j, OPACITY] * libm_exp(-sigma), ZERO), e, dy

@@ -1,4 +1,4 @@
-"""Prepare photographs for structure from motion: upright and shrunk copies, their masks, and which share a camera.
+"""Prepare photographs for structure from motion: upright and shrunk copies, their masks, and their cameras.
 
 Photographs share a camera if size, make, model and focal length agree: another zoom setting is another camera. Values
 that the EXIF data lack count as equal. Copies keep the focal length, COLMAP's initial value; location and time are left
@@ -21,8 +21,8 @@ from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.images import (
     MASK_THRESHOLD,
     SAVE_OPTIONS,
+    decode_pixels,
     open_image,
-    pixels_of,
     read_mask,
     resize_mask,
     write_image,
@@ -124,7 +124,7 @@ def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> t
     """Write the copy of a photograph; return its group, and its mask at the copy's size if it has one."""
     with open_image(file) as opened:
         exif = _focal_exif(opened)
-        pixels = pixels_of(ImageOps.exif_transpose(opened))  # [H, W, 3 or 4], upright
+        pixels = decode_pixels(ImageOps.exif_transpose(opened))  # [H, W, 3 or 4], upright
     mask = None if pixels.shape[2] == 3 else pixels[..., 3] >= MASK_THRESHOLD
     if mask_file is not None:
         given = read_mask(mask_file)

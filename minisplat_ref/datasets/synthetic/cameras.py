@@ -22,9 +22,9 @@ class Orbit(NamedTuple):
     target: Floats
     """[3] point that every camera looks at, world frame."""
     radius: tuple[float, float]
-    """Least and largest horizontal distance from the target, world units."""
+    """Minimum and maximum horizontal distance from the target, world units."""
     height: tuple[float, float]
-    """Least and largest z of a camera, world units."""
+    """Minimum and maximum z of a camera, world units."""
     fov_degrees: float
     """Horizontal field of view."""
 

@@ -1,7 +1,7 @@
 """Synthetic scenes, stage 9: a scene as a folder that every splatting program reads.
 
-``images/*.png`` and ``sparse/0/{cameras,images,points3D}.txt`` are a COLMAP text model with tracks. The truth is beside
-it: ``depths/*.npy`` and ``normals/*.npy`` (float32), ``ids/*.npy`` (int16), and ``scene_info.json``.
+``images/*.png`` and ``sparse/0/{cameras,images,points3D}.txt`` are a COLMAP text model with tracks. The truth is stored
+with it: ``depths/*.npy`` and ``normals/*.npy`` (float32), ``ids/*.npy`` (int16), and ``scene_info.json``.
 """
 
 import json

@@ -29,7 +29,7 @@ def room_shell(floor: Texture, walls: tuple[Texture, ...]) -> list[Primitive]:
     return shell
 
 
-def picture(centre: Floats, angle: float, lattice: Floats, low: str, high: str) -> list[Primitive]:
+def painting(centre: Floats, angle: float, lattice: Floats, low: str, high: str) -> list[Primitive]:
     """A framed abstract painting, flat on a wall."""
     upright = rotate_z(angle) @ _STANDING
     front = upright[:, 2]

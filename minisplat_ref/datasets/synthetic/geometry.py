@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 2: shapes placed in the world, and which of them a ray hits first.
+"""Synthetic scenes, stage 2: shapes placed in the world, and the first of them that a ray hits.
 
 Placing is a rotation and a translation, which keep the ray parameter t, so that distances need no conversion. Nothing
 is transparent, and there is no acceleration structure: a bounding sphere each is enough for a few dozen primitives.

@@ -108,7 +108,7 @@ class Bricks:
         from_end = (along - brick) * self.length
         from_bed = up - course * self.height
         is_joint = (from_end < self.joint_width) | (from_bed < self.joint_width)
-        shade = self.noise.at_cells(course.astype(int), brick.astype(int))
+        shade = self.noise.cell_colors(course.astype(int), brick.astype(int))
         shade = 0.65 * shade + 0.35 * self.noise.values(points)
         return np.where(is_joint[:, None], linear_rgb(self.joint), _blend(self.dark, self.light, shade))
 
@@ -138,7 +138,7 @@ class Noise:
             weight += 0.5**octave
         return np.clip(0.5 + self.contrast * (total / weight - 0.5), 0.0, 1.0)
 
-    def at_cells(self, i: Ints, j: Ints) -> Floats:
+    def cell_colors(self, i: Ints, j: Ints) -> Floats:
         """[n] one random number in [0, 1] for each pair of integers."""
         return self.lattice[i % len(self.lattice), j % len(self.lattice), 0]
 

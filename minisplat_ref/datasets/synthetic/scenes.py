@@ -14,7 +14,7 @@ from minisplat_ref.datasets.synthetic.furniture import (
     ROOM_HEIGHT,
     chair,
     fence,
-    picture,
+    painting,
     place,
     rack,
     room_shell,
@@ -56,8 +56,8 @@ def room(rng: np.random.Generator) -> Setting:
     )
     primitives = [
         *room_shell(Bricks("#5b3a24", "#8a5a34", "#c08a55", 1.3, 0.2, 0.012, streaks), walls),
-        *picture(np.array([2.58, 0.5, 1.45]), -90.0, lattice, "#274b7a", "#f2b84b"),
-        *picture(np.array([-2.58, -0.4, 1.4]), 90.0, lattice, "#7a2848", "#9fd3c7"),
+        *painting(np.array([2.58, 0.5, 1.45]), -90.0, lattice, "#274b7a", "#f2b84b"),
+        *painting(np.array([-2.58, -0.4, 1.4]), 90.0, lattice, "#7a2848", "#9fd3c7"),
         place(Cylinder(1.25, 0.01), Checker("#efe4cf", "#35608c", 0.28), [0.0, 0.0, 0.01]),
         *chair(np.array([0.55, 0.35, 0.02]), 35.0),
         *table(np.array([-0.5, 0.35, 0.02]), lattice),

@@ -1,7 +1,7 @@
 """Synthetic scenes, stage 1: intersections of rays with rectangles, boxes, spheres and cylinders, in closed form.
 
-A ray is ``origin + t * direction`` with a direction of any length; an intersection is the least t > 0, infinity where
-there is none. Every shape lies in its own frame, centred at 0 and aligned with the axes. No triangle meshes.
+A ray is ``origin + t * direction`` with a direction of any length; an intersection is the smallest t > 0, infinity
+where there is none. Every shape lies in its own frame, centred at 0 and aligned with the axes. No triangle meshes.
 """
 
 from dataclasses import dataclass

@@ -59,10 +59,10 @@ def true_surface(folder: Path, scene: Scene) -> Surface | None:
         for view, depth in zip(scene.train_views, depths, strict=True)
     ]
     depths = [depth / scene.frame.unit for depth in depths]
-    return surface_near(unproject_views(cameras, depths), cameras, scene.extent)
+    return nearest_surface(unproject_views(cameras, depths), cameras, scene.extent)
 
 
-def surface_near(points: Floats, cameras: Sequence[Camera], extent: float) -> Surface | None:
+def nearest_surface(points: Floats, cameras: Sequence[Camera], extent: float) -> Surface | None:
     """Return the surface near the cameras, of points [P, 3]; None if nothing is."""
     centre = np.mean([camera.center for camera in cameras], axis=0)  # [3]
     points = points[_is_near(points, centre, extent)]
@@ -72,7 +72,7 @@ def surface_near(points: Floats, cameras: Sequence[Camera], extent: float) -> Su
 
 
 def unproject_views(cameras: Sequence[Camera], depths: Sequence[Floats]) -> Floats:
-    """Return the points [P, 3] of the world that pixels of depth [H, W] show; a depth of 0 is that of the sky."""
+    """Return the points [P, 3] of the world that pixels of depth [H, W] show; the depth is 0 at the sky."""
     points = []
     for camera, depth in zip(cameras, depths, strict=True):
         rays = pixel_rays(camera, 0.5, 0.5, np.arange(camera.height))  # [H * W, 3] of camera z = 1

@@ -38,14 +38,14 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.frames import place_camera
     from minisplat_ref.io.run_files import CAMERAS
     from minisplat_ref.rendering import Request
-    from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
+    from minisplat_ref.training.saved_state import read_bundles, read_frame, recorded_recipe
     from minisplat_ref.types import Model, view_from
 
     folder, checkpoint = args.run_folder, args.run_folder / "checkpoint.npz"
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder: give that of the run, a PLY alone has no memory to read")
     arrays, metadata = load_checkpoint(checkpoint)
-    recipe, _ = written_by(metadata)
+    recipe, _ = recorded_recipe(metadata)
     if recipe != CUS.name:
         raise InputError(f"{folder} was trained by recipe {recipe}, without features: train with --recipe {CUS.name}")
     bundles, frame = read_bundles(checkpoint, arrays, Anchors), read_frame(checkpoint, metadata)

@@ -22,7 +22,7 @@ from minisplat_ref.extensions.gaustudio.reference import (
 )
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
-from minisplat_ref.strategy.initialization import from_means
+from minisplat_ref.strategy.initialization import gaussians_from_means
 from minisplat_ref.strategy.removal import CHANGES
 from minisplat_ref.training.sky import SKY, clear_sky, unit_rays, with_sky
 from minisplat_ref.types import NOTHING, Camera, Floats, Model, RenderOutput, View
@@ -86,7 +86,7 @@ def sky_map() -> Background:
 def white_ball(n: int) -> Floats:
     """Return the parameter [n, 5] of a ball: white, with sizes and opacities as 3DGS gives them to points."""
     white = np.full((n, 3), (WHITE - 0.5) / SH_C0, np.float32)
-    g = from_means(fibonacci_directions(n), white, sh_degree=0)
+    g = gaussians_from_means(fibonacci_directions(n), white, sh_degree=0)
     start = np.column_stack([g.sh_dc, g.opacity_logits, g.log_scales[:, 0]])
     assert start.shape[1] == BALL_COLUMNS
     return start

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import DEPTH_ALPHA_MIN
-from minisplat_ref.cpu.projection import pose_of
+from minisplat_ref.cpu.projection import pack_pose
 from minisplat_ref.extensions.geometry.formulas import edge_weight, huber, huber_vjp, pixel_normal, pixel_normal_vjp
 from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
-from minisplat_ref.scalar.projection import dot, rows_of, to_camera
+from minisplat_ref.scalar.projection import dot, matrix_rows, to_camera
 from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
@@ -188,7 +188,7 @@ def _look_up(
 ):
     height, width = depth.shape
     for i in prange(points.shape[0]):
-        x, y, z = to_camera(rows_of(pose.R), pose.centre, points[i, 0], points[i, 1], points[i, 2])
+        x, y, z = to_camera(matrix_rows(pose.R), pose.centre, points[i, 0], points[i, 1], points[i, 2])
         if not z > ZERO:
             continue
         u, v = intrinsics[0] * x / z + intrinsics[2], intrinsics[1] * y / z + intrinsics[3]
@@ -249,7 +249,7 @@ def _seen_points(depth: Floats, camera: Camera, intrinsics: Floats, points: Floa
     n = len(points)
     pixels, costs, slopes = np.full(n, -1), np.zeros(n), np.zeros(n)
     points = np.ascontiguousarray(points, np.float64)
-    _look_up(points, pose_of(camera), intrinsics, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
+    _look_up(points, pack_pose(camera), intrinsics, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
     is_seen = pixels >= 0
     return pixels[is_seen], costs[is_seen], slopes[is_seen]
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.compositing.hits import lists_of, sum_slots
+from minisplat_ref.cpu.compositing.hits import pack_lists, sum_slots
 from minisplat_ref.cpu.compositing.pixel_rows import (
     KernelPrimitives,
     full_transmittance,
@@ -27,7 +27,7 @@ from minisplat_ref.cpu.compositing.pixel_rows import (
     row_pixels,
 )
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import pack_frame
 from minisplat_ref.extensions.texture_splat.reference import N_CHANNELS, REACH, TexelGradient
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, accumulate, gather, load, reduce_any, reduce_sum, select, store
@@ -227,8 +227,8 @@ def blend_texels(surfels: Surfels, texels: Floats, bins: TileBins, conventions: 
     forward_kernel(response)(
         _primitives(response, surfels, texels),
         dtype.type(round(texels.shape[1] ** 0.5)),
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins, response),
+        pack_frame(bins, conventions, dtype),
         n_threads(),
         out,
     )
@@ -246,8 +246,8 @@ def blend_texels_vjp(
     backward_kernel(response)(
         _primitives(response, surfels, texels),
         dtype.type(round(texels.shape[1] ** 0.5)),
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins, response),
+        pack_frame(bins, conventions, dtype),
         n_threads(),
         Channels(*(np.ascontiguousarray(array, dtype).reshape(-1, N_CHANNELS) for array in (image, v_image))),
         slots,

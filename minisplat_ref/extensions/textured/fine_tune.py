@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from minisplat_ref.datasets.named_scenes import read_scene
     from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
-    from minisplat_ref.training.representation import floats_of
+    from minisplat_ref.training.representation import count_floats
 
     if not 1 <= args.degree <= DEGREE:
         raise InputError(f"--degree is {args.degree}: give 1, 2 or 3")
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
     after = measure(textured, scene, scene.test_views)
     save_ply(args.out, textured, Label("textured"))
     print(
-        f"{len(gaussians.means):,} Gaussians, {floats_of(gaussians)} numbers each: test PSNR {before.psnr:.2f} dB,"
-        f" SSIM {before.ssim:.4f}\nwith textures, {floats_of(textured)} numbers each: {after.psnr:.2f} dB,"
+        f"{len(gaussians.means):,} Gaussians, {count_floats(gaussians)} numbers each: test PSNR {before.psnr:.2f} dB,"
+        f" SSIM {before.ssim:.4f}\nwith textures, {count_floats(textured)} numbers each: {after.psnr:.2f} dB,"
         f" {after.ssim:.4f}; in {args.out}"
     )
     return 0

@@ -38,13 +38,13 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.run_files import CAMERAS, POINT_CLOUD
     from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
     from minisplat_ref.training.recipe_settings import find_alternatives
-    from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
+    from minisplat_ref.training.saved_state import read_bundles, read_frame, recorded_recipe
 
     folder, checkpoint = args.run_folder, args.run_folder / "checkpoint.npz"
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder: give that of the run, a PLY alone has no network to evaluate")
     arrays, metadata = load_checkpoint(checkpoint)
-    recipe, _ = written_by(metadata)
+    recipe, _ = recorded_recipe(metadata)
     if recipe != VDGS.name:
         raise InputError(f"{folder} was trained by recipe {recipe}, without a network: train with --recipe {VDGS.name}")
     cameras = {view.name: view.camera for view in viewpoints.read(folder / CAMERAS)}

@@ -28,12 +28,12 @@ from minisplat_ref.io.formats import Format
 from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
+    decode_logits,
+    drop_largest,
     finish,
-    logits_of,
     opacity_bytes,
     refuse_size,
-    with_largest,
-    without_largest,
+    restore_largest,
 )
 from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.io.ply_file import read_header
@@ -81,7 +81,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         bounds[:, :, 0], bounds[:, :, 1] = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
     low, high = np.moveaxis(bounds.astype(np.float64)[np.arange(n) // CHUNK], 2, 0)  # [N, 3, 3] each
     shares = np.clip((values - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
-    largest, others = without_largest(sorted_.quats)
+    largest, others = drop_largest(sorted_.quats)
     words = np.empty((n, 4), "<u4")
     words[:, 0] = _pack(shares[:, 0], BITS)
     words[:, 1] = largest.astype(np.uint32) << 30 | _pack(others, np.array([10, 10, 10]))
@@ -137,11 +137,11 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     ends = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256.0))
     gaussians = Gaussians(
         means=values[:, 0],
-        quats=with_largest(
+        quats=restore_largest(
             (parts.words[:, 1] >> 30).astype(np.int64), _unpack(parts.words[:, 1], np.array([10, 10, 10]))
         ),
         log_scales=values[:, 1],
-        opacity_logits=logits_of((parts.words[:, 3] & 255).astype(np.uint8)),
+        opacity_logits=decode_logits((parts.words[:, 3] & 255).astype(np.uint8)),
         sh_dc=(values[:, 2] - 0.5) / SH_C0,
         sh_rest=(SH_RANGE * (ends - 0.5)).reshape(n, 3, rest.shape[1] // 3).transpose(0, 2, 1),
     )

@@ -37,9 +37,9 @@ from minisplat_ref.io.formats.levels8 import (
     check_float32,
     color_bytes,
     finish,
+    finite_scales,
     opacity_bytes,
     refuse_size,
-    scales_of,
 )
 from minisplat_ref.types import Floats, Gaussians
 
@@ -73,7 +73,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         A value is not finite, or a scale is beyond float32.
     """
     check_float32(gaussians)
-    scales = scales_of(gaussians)
+    scales = finite_scales(gaussians)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats.astype(np.float64), axis=1, keepdims=True)
     colors = np.concatenate([color_bytes(gaussians.sh_dc), opacity_bytes(gaussians.opacity_logits)[:, None]], axis=1)
     n_rest = gaussians.sh_rest.shape[1]

@@ -26,7 +26,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.formats import Format
-from minisplat_ref.io.formats.levels8 import WAY_OUT, finish, logits_of, refuse_size, sh_dc_of
+from minisplat_ref.io.formats.levels8 import WAY_OUT, decode_logits, decode_sh_dc, finish, refuse_size
 from minisplat_ref.types import Floats, Gaussians
 
 HEADER_BYTES, SECTION_BYTES = 4096, 1024
@@ -123,8 +123,8 @@ def _read_section(content: bytes, file: _File, section: _Section, begin: int, so
         means=means,
         quats=rows["quats"].astype(np.float64),
         log_scales=np.where(scales > 0, np.log(np.where(scales > 0, scales, 1.0)), LOG_SCALE_OF_ZERO),
-        opacity_logits=logits_of(rows["rgba"][:, 3]),
-        sh_dc=sh_dc_of(rows["rgba"][:, :3]),
+        opacity_logits=decode_logits(rows["rgba"][:, 3]),
+        sh_dc=decode_sh_dc(rows["rgba"][:, :3]),
         sh_rest=np.concatenate([np.zeros((section.n, 0, 3)), *bands], axis=1),
     )
 

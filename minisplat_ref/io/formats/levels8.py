@@ -25,7 +25,7 @@ def opacity_bytes(logits: Floats) -> NDArray[np.uint8]:
     return to_bytes(0.5 * (1.0 + np.tanh(0.5 * logits.astype(np.float64))))
 
 
-def logits_of(levels: NDArray[np.uint8]) -> Floats:
+def decode_logits(levels: NDArray[np.uint8]) -> Floats:
     """Return the logits of opacities in 255ths; 0 and 1, which have none, as a quarter of a level away."""
     clipped = np.clip(levels.astype(np.float64), 0.25, 254.75)
     return np.log(clipped / (255.0 - clipped))
@@ -36,12 +36,12 @@ def color_bytes(sh_dc: Floats) -> NDArray[np.uint8]:
     return to_bytes(0.5 + SH_C0 * sh_dc.astype(np.float64))
 
 
-def sh_dc_of(levels: NDArray[np.uint8]) -> Floats:
+def decode_sh_dc(levels: NDArray[np.uint8]) -> Floats:
     """Return the coefficients of degree 0 of colours in 255ths."""
     return (levels / 255.0 - 0.5) / SH_C0
 
 
-def without_largest(quats: Floats) -> tuple[Ints, Floats]:
+def drop_largest(quats: Floats) -> tuple[Ints, Floats]:
     """Return the index of the largest of w, x, y, z [N], and the other components [N, 3] in [0, 1].
 
     Of unit quaternions with a positive largest component no other is beyond ``1 / sqrt(2)``; u = q / sqrt(2) + 1/2.
@@ -52,8 +52,8 @@ def without_largest(quats: Floats) -> tuple[Ints, Floats]:
     return largest, np.take_along_axis(unit, OTHERS[largest], axis=1) / math.sqrt(2.0) + 0.5
 
 
-def with_largest(largest: Ints, others: Floats) -> Floats:
-    """Return unit quaternions [N, 4], wxyz, from the output of :func:`without_largest`."""
+def restore_largest(largest: Ints, others: Floats) -> Floats:
+    """Return unit quaternions [N, 4], wxyz, from the output of :func:`drop_largest`."""
     others = math.sqrt(2.0) * (others - 0.5)
     quats = np.empty((len(others), 4))
     np.put_along_axis(quats, OTHERS[largest], others, axis=1)
@@ -88,7 +88,7 @@ def check_float32(gaussians: Gaussians) -> None:
         check_gaussians(Gaussians(*(field.astype(np.float32) for field in gaussians)), "Gaussians")
 
 
-def scales_of(gaussians: Gaussians) -> NDArray[np.float32]:
+def finite_scales(gaussians: Gaussians) -> NDArray[np.float32]:
     """Return the scales [N, 3] of Gaussians, for files that do not hold their logarithms.
 
     Raises

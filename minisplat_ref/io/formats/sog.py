@@ -37,11 +37,11 @@ from minisplat_ref.io.formats import Format
 from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
+    decode_logits,
+    drop_largest,
     finish,
-    logits_of,
     opacity_bytes,
-    with_largest,
-    without_largest,
+    restore_largest,
 )
 from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.types import Floats, Gaussians, Ints
@@ -81,7 +81,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     logs = np.sign(sorted_.means) * np.log1p(np.abs(sorted_.means))  # [N, 3]
     mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
     steps = np.rint(65535 * (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0)).astype(np.uint16)
-    largest, others = without_largest(sorted_.quats)
+    largest, others = drop_largest(sorted_.quats)
     scale_book, scales = _codebook(sorted_.log_scales)
     color_book, colors = _codebook(sorted_.sh_dc)
     quats = np.concatenate([np.floor(255.0 * others + 0.5), MODE + largest[:, None]], axis=1)  # [N, 4]
@@ -194,9 +194,9 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         raise InputError(f"{source}: damaged, a rotation has the mode {quats[:, 3].min()}; {WAY_OUT}")
     gaussians = Gaussians(
         means=means,
-        quats=with_largest(quats[:, 3] - MODE, quats[:, :3] / 255.0),
+        quats=restore_largest(quats[:, 3] - MODE, quats[:, :3] / 255.0),
         log_scales=_look_up(meta["scales"], scales[:, :3], source),
-        opacity_logits=logits_of(sh0[:, 3].astype(np.uint8)),
+        opacity_logits=decode_logits(sh0[:, 3].astype(np.uint8)),
         sh_dc=_look_up(meta["sh0"], sh0[:, :3], source),
         sh_rest=_harmonics(file, source),
     )

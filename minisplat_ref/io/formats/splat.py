@@ -23,11 +23,11 @@ from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
     color_bytes,
+    decode_logits,
+    decode_sh_dc,
     finish,
-    logits_of,
+    finite_scales,
     opacity_bytes,
-    scales_of,
-    sh_dc_of,
 )
 from minisplat_ref.types import Gaussians
 
@@ -44,7 +44,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     """
     check_float32(gaussians)
     rows = np.empty(len(gaussians.means), ROW)
-    rows["scales"] = scales_of(gaussians)
+    rows["scales"] = finite_scales(gaussians)
     if gaussians.sh_rest.size:
         warnings.warn(".splat holds no harmonics above degree 0: they are left out", InputWarning, stacklevel=2)
     rows["means"] = gaussians.means
@@ -74,8 +74,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
             means=rows["means"],
             quats=(rows["quats"].astype(np.float64) - 128.0) / 128.0,
             log_scales=np.log(rows["scales"].astype(np.float64)),
-            opacity_logits=logits_of(rows["rgba"][:, 3]),
-            sh_dc=sh_dc_of(rows["rgba"][:, :3]),
+            opacity_logits=decode_logits(rows["rgba"][:, 3]),
+            sh_dc=decode_sh_dc(rows["rgba"][:, :3]),
             sh_rest=np.zeros((len(rows), 0, 3)),
         )
     return finish(source, gaussians)

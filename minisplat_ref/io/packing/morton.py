@@ -20,7 +20,7 @@ _SPREAD = (
 )
 
 
-def cells_of(points: Floats | Ints, *, is_cubic: bool = True) -> NDArray[np.uint64]:
+def morton_cells(points: Floats | Ints, *, is_cubic: bool = True) -> NDArray[np.uint64]:
     """Return the cell of each point in the smallest cube, or box, that holds them all, with 2^21 cells per side.
 
     Parameters
@@ -56,4 +56,4 @@ def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def morton_order(points: Floats | Ints, *, is_cubic: bool = True) -> Ints:
     """Return the rows [N] of points [N, 3] in Morton order; points of one cell keep their order."""
-    return np.argsort(morton_codes(cells_of(points, is_cubic=is_cubic)), kind="stable")
+    return np.argsort(morton_codes(morton_cells(points, is_cubic=is_cubic)), kind="stable")

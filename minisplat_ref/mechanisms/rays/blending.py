@@ -14,7 +14,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
-from minisplat_ref.reference.hits import goes_on
+from minisplat_ref.reference.hits import is_accepted
 from minisplat_ref.types import Floats, Ints
 
 PAIRS_AT_ONCE = 1 << 18  # of rays and Gaussians: some thirty arrays of float64, 60 MB
@@ -75,7 +75,7 @@ def list_hits(meeting: Meeting, rays: Rays, conventions: Conventions) -> Hits:
         order = np.argsort(np.where(is_hit, t, np.inf), axis=1, kind="stable")  # [P', N]
         alpha = np.take_along_axis(np.where(is_hit, alpha, 0.0), order, axis=1)
         after = np.cumprod(1 - alpha, axis=1)
-        alpha = np.where(goes_on(after, conventions), alpha, 0.0)  # T never rises, so only the end is cut off
+        alpha = np.where(is_accepted(after, conventions), alpha, 0.0)  # T never rises, so only the end is cut off
         T = np.cumprod(np.column_stack([np.ones(len(some)), 1 - alpha]), axis=1)  # [P', N + 1]
         row, place = np.nonzero(alpha > 0)  # of each ray in its order
         found = order[row, place]

@@ -57,7 +57,7 @@ def tracer_of(response: RayResponse, tree: RayTree) -> Tracer:
 
 
 @scalar
-def goes_on(T, limits):
+def is_accepted(T, limits):
     """Return whether a ray takes a hit that leaves it with the transmittance T."""
     return T > limits.transmittance_min or (T == limits.transmittance_min and not limits.stops_at_equality)
 
@@ -130,7 +130,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         unclamped = found.unclamped[lane, count]
                         alpha = min(limits.alpha_max, unclamped)
                         after = T * (1.0 - alpha)
-                        if not goes_on(after, limits):
+                        if not is_accepted(after, limits):
                             break
                         row = found.rows[lane, count]
                         weight, g = alpha * T, tree.gaussian_ids[row]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.cpu.gaussian_rows import eight_rows
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, gather, load, maximum, minimum, reduce_any, reduce_max, select, store
 from minisplat_ref.mechanisms.rays.bvh import IS_INNER, LEVELS_MAX
@@ -163,7 +163,7 @@ def finder(meet: Callable) -> Callable:
         records, ids, boxes, children = tree.records, tree.gaussian_ids, tree.boxes, tree.children
         depths, alphas, rows, counts, left, bounds, nodes, entries, ts, qs = found
         least, alpha_min, alpha_max = END_MARGIN * limits.transmittance_min, limits.alpha_min, limits.alpha_max
-        eight = rows_from(first, end)
+        eight = eight_rows(first, end)
         ray, near, far = rays_of(rays, eight), gather(rays.near, eight, 0), gather(rays.far, eight, 0)
         line = ray[0], ray[1], ray[2], inverse_of(ray[3]), inverse_of(ray[4]), inverse_of(ray[5])
         bound, farthest = far, reduce_max(far)

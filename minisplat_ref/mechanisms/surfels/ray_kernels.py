@@ -16,18 +16,18 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
-from minisplat_ref.cpu.compositing.hits import lists_of, sum_slots
+from minisplat_ref.cpu.compositing.hits import pack_lists, sum_slots
 from minisplat_ref.cpu.compositing.pixel_rows import (
     KernelPrimitives,
-    field_of,
     full_transmittance,
     hit_row,
     list_rows,
+    load_field,
     row_of_tile,
     row_pixels,
 )
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import pack_frame
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
@@ -95,11 +95,11 @@ def forward_kernel(response: KernelResponse) -> Callable:
                     store(state, 0, full_transmittance(row, frame, state.dtype.type))
                     measure_row(state, primitives, row, frame)
                     pixels = row_pixels(row, frame)
-                    scatter(out, pixels, OUT_MEDIAN, field_of(state, MEDIAN, row, frame))
-                    scatter(out, pixels, OUT_DISTORTION, field_of(state, DISTORTION, row, frame))
-                    scatter(out, pixels, OUT_RANK, field_of(state, RANK, row, frame))
-                    scatter(out, pixels, OUT_M, field_of(state, M, row, frame))
-                    scatter(out, pixels, OUT_ALPHA, ONE - abs(field_of(state, 0, row, frame)))
+                    scatter(out, pixels, OUT_MEDIAN, load_field(state, MEDIAN, row, frame))
+                    scatter(out, pixels, OUT_DISTORTION, load_field(state, DISTORTION, row, frame))
+                    scatter(out, pixels, OUT_RANK, load_field(state, RANK, row, frame))
+                    scatter(out, pixels, OUT_M, load_field(state, M, row, frame))
+                    scatter(out, pixels, OUT_ALPHA, ONE - abs(load_field(state, 0, row, frame)))
 
     return measure_tiles
 
@@ -166,8 +166,8 @@ def measure_rays(surfels: Surfels, bins: TileBins, conventions: Conventions, dty
     out = np.empty((shape[0] * shape[1], N_OUT), dtype)
     forward_kernel(response)(
         _primitives(response, surfels, dtype),
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins, response),
+        pack_frame(bins, conventions, dtype),
         n_threads(),
         out,
     )
@@ -191,8 +191,8 @@ def measure_rays_vjp(
     slots = np.empty((len(bins.gaussian_ids), response.n_gradients), dtype)
     backward_kernel(response)(
         _primitives(response, surfels, dtype),
-        lists_of(bins, response),
-        frame_of(bins, conventions, dtype),
+        pack_lists(bins, response),
+        pack_frame(bins, conventions, dtype),
         n_threads(),
         out,
         np.column_stack([np.ravel(v_median), np.ravel(v_distortion)]).astype(dtype),

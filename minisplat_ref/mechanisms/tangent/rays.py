@@ -8,7 +8,7 @@ import numpy as np
 from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
 from minisplat_ref.mechanisms.orders import blending_order
 from minisplat_ref.mechanisms.tangent.planes import hit, project
-from minisplat_ref.reference.hits import Hit, conic_hit, goes_on
+from minisplat_ref.reference.hits import Hit, conic_hit, is_accepted
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Primitives
@@ -79,7 +79,7 @@ def ray_colors(
     order = blending_order(is_hit, found.hit.depths, buffer_size)
     alphas = np.take_along_axis(np.where(is_hit, alphas, 0), order, axis=0)
     T = np.cumprod(np.concatenate([np.ones((1, len(rays))), 1 - alphas]), axis=0)
-    alphas = np.where(goes_on(T[1:], conventions), alphas, 0)
+    alphas = np.where(is_accepted(T[1:], conventions), alphas, 0)
     light: Floats = np.einsum("gp,gpd->pd", alphas * T[:-1], colors[found.ids][order])
     return light
 

@@ -7,7 +7,7 @@ all photographs. Where some show them smaller, by their resolution or from afar,
 others: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`).
 """
 
-from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, halves_of, pairs, render_clipped, weigh
+from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, pairs, render_clipped, split_halves, weigh
 from minisplat_ref.training.compensation import compensate, compensation
 from minisplat_ref.training.pace import trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
@@ -19,11 +19,11 @@ def antialiasing_evidence(state: TrainState, iteration: Iteration, view_ids: lis
     photographs = []
     for view, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
         field = render_clipped(state, iteration, view, request) - rendered
-        photographs.append(halves_of(photograph - rendered, field[None], is_counted))
+        photographs.append(split_halves(photograph - rendered, field[None], is_counted))
     return weigh(photographs)
 
 
-def ask_about_antialiasing(state: TrainState, iteration: Iteration) -> Answer | str:
+def examine_antialiasing(state: TrainState, iteration: Iteration) -> Answer | str:
     """Return whether halves of photographs explain each other by different amounts of compensation."""
     if iteration.render_settings.conventions.is_antialiased:
         return "opacities are compensated"

@@ -101,7 +101,7 @@ def cut_degrees_when_cooling(state: TrainState, iteration: Iteration, *, min_var
         return
     iteration.fetch()
     degrees, is_seen = state.stats[DEGREES], state.stats.pop(SEEN)
-    state.gaussians, state.stats[DEGREES] = without_idle_degrees(
+    state.gaussians, state.stats[DEGREES] = drop_idle_degrees(
         state.gaussians, degrees, iteration.scene.train_views, is_seen, min_variation
     )
     is_absent = np.arange(state.gaussians.sh_rest.shape[1]) >= n_coefficients(state.stats[DEGREES])[:, None]
@@ -122,7 +122,7 @@ def describe_degrees(state: TrainState) -> str:
     )
 
 
-def without_idle_degrees(
+def drop_idle_degrees(
     gaussians: Gaussians, degrees: Ints, views: tuple[View, ...], is_seen: Bools, min_variation: float
 ) -> tuple[Gaussians, Ints]:
     """Remove the highest degrees of each Gaussian while they vary by less than ``min_variation``.

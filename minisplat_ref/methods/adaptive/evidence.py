@@ -88,7 +88,7 @@ class Answer(NamedTuple):
     """Returns the initial parameters of the calibration, and changes the model as far as it has to make way for it."""
 
 
-def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:
+def split_halves(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:
     """Return the left and the right half of a photograph.
 
     Parameters
@@ -164,8 +164,8 @@ def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequenc
     photographs = []
     for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
         seen, there = rendered.mean(axis=2), photograph.mean(axis=2)
-        says = is_counted & (seen > DARK) & (there > DARK) & (there < BRIGHT)
-        photographs.append(halves_of(photograph - rendered, rendered[None], says))
+        is_usable = is_counted & (seen > DARK) & (there > DARK) & (there < BRIGHT)
+        photographs.append(split_halves(photograph - rendered, rendered[None], is_usable))
     return weigh(photographs)
 
 
@@ -183,7 +183,7 @@ def _halves_beside_slopes(
     state: TrainState, iteration: Iteration, view_ids: Sequence[int]
 ) -> Iterator[tuple[Half, Half]]:
     for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
-        yield halves_of(photograph - rendered, slopes(rendered), is_counted)
+        yield split_halves(photograph - rendered, slopes(rendered), is_counted)
 
 
 def slopes(image: Floats) -> Floats:

@@ -45,14 +45,14 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
         view = iteration.scene.train_views[index].load()
         rendered = renderer.render(state.model, view, request)[0].image
         seen, photographed = (np.mean(image, axis=2) for image in (np.clip(rendered, 0, 1), view.image / 255.0))
-        says = (seen > DARK) & (photographed > DARK) & (photographed < BRIGHT)
-        says = says if view.mask is None else says & view.mask
-        if says.any():
-            gains[k] = np.median(np.log(photographed[says] / seen[says]))
+        is_usable = (seen > DARK) & (photographed > DARK) & (photographed < BRIGHT)
+        is_usable = is_usable if view.mask is None else is_usable & view.mask
+        if is_usable.any():
+            gains[k] = np.median(np.log(photographed[is_usable] / seen[is_usable]))
     return gains
 
 
-def ask_about_exposures(state: TrainState, iteration: Iteration) -> Answer:
+def examine_exposures(state: TrainState, iteration: Iteration) -> Answer:
     """Return whether gains fitted to one half of each photograph explain the other; exposures begin with these."""
     n_views = len(iteration.scene.train_views)
     ids = trained_ids(n_views, iteration.cooling, state.pace)
@@ -61,7 +61,7 @@ def ask_about_exposures(state: TrainState, iteration: Iteration) -> Answer:
 
     def begin() -> dict[str, Floats]:
         exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)
-        _begin_with(exposures[EXPOSURES], ids, gains - gains.mean())
+        _set_gains(exposures[EXPOSURES], ids, gains - gains.mean())
         return exposures
 
     return Answer(evidence, why, begin)
@@ -79,10 +79,10 @@ def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:
 def begin_exposures(state: TrainState, iteration: Iteration, view_ids: list[int]) -> None:
     """Have views that join the training start with their gains."""
     if EXPOSURES in state.shared:
-        _begin_with(state.shared[EXPOSURES], view_ids, log_gains(state, iteration, view_ids))
+        _set_gains(state.shared[EXPOSURES], view_ids, log_gains(state, iteration, view_ids))
 
 
-def _begin_with(exposures: Floats, view_ids: list[int], gains: Floats) -> None:
+def _set_gains(exposures: Floats, view_ids: list[int], gains: Floats) -> None:
     """Set the exposures of views to gains, given as logarithms."""
     for index, gain in zip(view_ids, gains, strict=True):
         exposures[index, :, :3] = np.exp(gain) * np.eye(3)

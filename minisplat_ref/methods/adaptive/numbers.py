@@ -2,7 +2,7 @@
 
 Letters name the sections of ``docs/measured/adaptive.md``. ``--set`` reaches those that an action takes as a setting.
 Two numbers are shared with others: how far halves are apart (:data:`minisplat_ref.strategy.halving.OFFSET`), and the
-least side that any halved view may have (:data:`minisplat_ref.training.smaller_views.SIDE_MIN`).
+minimum side of halved views (:data:`minisplat_ref.training.smaller_views.SIDE_MIN`).
 """
 
 # --- the recipe ---

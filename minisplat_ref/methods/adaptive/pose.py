@@ -22,13 +22,13 @@ from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Camera, Floats
 
 
-def rotation_of(camera: Camera, displacement: Floats) -> Floats:
+def displacement_rotation(camera: Camera, displacement: Floats) -> Floats:
     """Return the rotation vector [3], radians, that displaces the middle of an image by (du, dv) pixels."""
     du, dv = displacement
     return np.array([-dv / camera.fy, du / camera.fx, 0.0])
 
 
-def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
+def examine_poses(state: TrainState, iteration: Iteration) -> Answer:
     """Return whether displacements fitted to one half of each photograph explain the other; poses begin with these."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
@@ -38,7 +38,7 @@ def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
     def begin() -> dict[str, Floats]:
         corrections = zero_corrections(len(views))
         for index, x in zip(ids, evidence.fitted, strict=True):
-            corrections[ROTATIONS][index] = rotation_of(views[index].camera, -x)
+            corrections[ROTATIONS][index] = displacement_rotation(views[index].camera, -x)
         return corrections
 
     return Answer(evidence, why, begin)
@@ -52,7 +52,7 @@ def turn_held_out(state: TrainState, iteration: Iteration) -> str | None:
     ids = held_out_ids(len(views), iteration.cooling.hold_out_every)
     found = displacements(state, iteration, ids)
     for index, displacement in zip(ids, found, strict=True):
-        state.shared[ROTATIONS][index] += rotation_of(views[index].camera, displacement)
+        state.shared[ROTATIONS][index] += displacement_rotation(views[index].camera, displacement)
     return f"by {np.sqrt(np.mean(found**2)):.2f} pixels"
 
 

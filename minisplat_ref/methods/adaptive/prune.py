@@ -68,7 +68,7 @@ def prune_in_slices(
         return
     number = slice_due(state.pace, iteration.step)
     if number is None:
-        if is_over(state.pace, iteration.step):
+        if is_prune_done(state.pace, iteration.step):
             take_all_views(state, iteration)
         return
     iteration.fetch()
@@ -101,7 +101,7 @@ def prune_in_slices(
     _record(state, iteration, why)
 
 
-def is_over(pace: Pace, step: int) -> bool:
+def is_prune_done(pace: Pace, step: int) -> bool:
     """Return whether no slice is due at an iteration or later."""
     if pace.cooling_from is None or pace.last_step is None:
         return False

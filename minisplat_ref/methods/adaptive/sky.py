@@ -126,7 +126,7 @@ def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int]
     return pixels
 
 
-def photographs_behind(
+def sum_photographs(
     state: TrainState, iteration: Iteration, pixels: Mapping[int, Ints], is_drawn: Bools | None
 ) -> list[Behind]:
     """Return the sums of training views over pixels, rendered with the Gaussians ``is_drawn`` [N]; None for all."""
@@ -143,7 +143,7 @@ def photographs_behind(
     return photographs
 
 
-def ask_about_a_sky(state: TrainState, iteration: Iteration) -> Answer | str:
+def examine_sky(state: TrainState, iteration: Iteration) -> Answer | str:
     """Return whether a sky instead of the large Gaussians, fitted to some photographs, explains the others better.
 
     It begins with the fit to all pixels, and the largest of these Gaussians go.
@@ -157,11 +157,11 @@ def ask_about_a_sky(state: TrainState, iteration: Iteration) -> Answer | str:
     pixels = open_pixels(state, iteration, ids, ~large)
     if len(pixels) < SKY_VIEWS_MIN:
         return f"{len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
-    evidence = compare(*(photographs_behind(state, iteration, pixels, rows) for rows in (None, ~large)))
+    evidence = compare(*(sum_photographs(state, iteration, pixels, rows) for rows in (None, ~large)))
     why = evidence.describe(f"a sky in place of {n:,} large Gaussians", "half of the photographs", "the others")
 
     def begin() -> dict[str, Floats]:
-        sky = fit_sky(photographs_behind(state, iteration, find_counted_pixels(iteration, ids), ~huge))
+        sky = fit_sky(sum_photographs(state, iteration, find_counted_pixels(iteration, ids), ~huge))
         apply_edit(state, keep(state.gaussians, ~huge))
         return {SKY: sky.astype(np.float32)}
 

@@ -8,12 +8,12 @@ the photographs' gain by it is above a minimum gain and above a number of standa
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from minisplat_ref.methods.adaptive.antialiasing import ask_about_antialiasing
+from minisplat_ref.methods.adaptive.antialiasing import examine_antialiasing
 from minisplat_ref.methods.adaptive.evidence import Answer
-from minisplat_ref.methods.adaptive.exposure import ask_about_exposures
+from minisplat_ref.methods.adaptive.exposure import examine_exposures
 from minisplat_ref.methods.adaptive.numbers import N_ERRORS, SKY_N_ERRORS
-from minisplat_ref.methods.adaptive.pose import ask_about_poses
-from minisplat_ref.methods.adaptive.sky import ask_about_a_sky
+from minisplat_ref.methods.adaptive.pose import examine_poses
+from minisplat_ref.methods.adaptive.sky import examine_sky
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, EXPOSURE, POSE, Calibration
 from minisplat_ref.training.pace import Decision
@@ -30,8 +30,8 @@ class Switch:
     """Its name in the record of decisions."""
     already: str
     """The message where it is on."""
-    ask: Callable[[TrainState, Iteration], Answer | str]
-    """Examines the photographs; returns a text where there is nothing to examine."""
+    examine: Callable[[TrainState, Iteration], Answer | str]
+    """Examines the photographs; returns the reason where there is nothing to examine."""
     n_errors: float = N_ERRORS
     """Standard errors that the gain must exceed."""
     rival: "Switch | None" = None
@@ -69,7 +69,7 @@ class Switch:
         """Return the photographs' evidence if it supports the calibration, and otherwise the reason against it."""
         if self.calibration.initial(1).keys() <= state.shared.keys():
             return self.already
-        answer = self.ask(state, iteration)
+        answer = self.examine(state, iteration)
         if isinstance(answer, str):
             return answer
         min_gain = min_gains[f"min_{self.calibration.name}_gain"]
@@ -102,12 +102,10 @@ def add_calibration(
     state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))
 
 
-switch_sky_on = Switch(BACKDROP, "sky", "there is a sky", ask_about_a_sky, SKY_N_ERRORS)
-switch_antialiasing_on = Switch(ANTIALIASING, "anti-aliasing", "opacities are compensated", ask_about_antialiasing)
-switch_exposure_on = Switch(
-    EXPOSURE, "exposures", "exposures are on", ask_about_exposures, rival=switch_antialiasing_on
-)
-switch_pose_on = Switch(POSE, "poses", "poses are refined", ask_about_poses)
+switch_sky_on = Switch(BACKDROP, "sky", "there is a sky", examine_sky, SKY_N_ERRORS)
+switch_antialiasing_on = Switch(ANTIALIASING, "anti-aliasing", "opacities are compensated", examine_antialiasing)
+switch_exposure_on = Switch(EXPOSURE, "exposures", "exposures are on", examine_exposures, rival=switch_antialiasing_on)
+switch_pose_on = Switch(POSE, "poses", "poses are refined", examine_poses)
 
 SWITCHES = {
     switch.calibration.name: switch

@@ -53,16 +53,16 @@ def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, 
     scene, n, turn = iteration.scene, n_rows(state.gaussians), iteration.step // PERIOD
     views = [view for view in scene.train_views if view.point_ids is not None and len(view.point_ids)]
     before, all_ = np.zeros(n), np.zeros(n)
-    for view in _some(views, VEIL_VIEWS_MAX, turn):
+    for view in _choose_evenly(views, VEIL_VIEWS_MAX, turn):
         assert view.point_ids is not None
-        some_points = view._replace(point_ids=_some(view.point_ids, VEIL_RAYS_MAX, turn))
+        some_points = view._replace(point_ids=_choose_evenly(view.point_ids, VEIL_RAYS_MAX, turn))
         lines = trace_sight_lines(state.model, some_points, scene.points, iteration.render_settings, MARGIN)
         all_ += np.bincount(lines.rows, lines.weights, minlength=n)
         before += np.bincount(lines.rows, lines.weights * lines.is_before, minlength=n)
     return before, all_
 
 
-def _some(items: Any, most: int, turn: int) -> Any:
-    """Return at most ``most`` items, evenly spaced; each turn begins with another one."""
-    stride = max(1, -(-len(items) // most))
+def _choose_evenly(items: Any, n_max: int, turn: int) -> Any:
+    """Return at most ``n_max`` items, evenly spaced; each turn begins with another one."""
+    stride = max(1, -(-len(items) // n_max))
     return items[turn % stride :: stride]

@@ -56,7 +56,7 @@ class Mark(NamedTuple):
 class Trace(NamedTuple):
     """The error of an array over several scenes."""
 
-    wrong_in: frozenset[str]
+    check_step: frozenset[str]
     """Scenes."""
     size: float = 0.0
     """Mean over these of the common logarithm of its size over the largest of the scene, at least ``LEAST_SHARE``."""
@@ -142,7 +142,7 @@ def _distance(found: Signature, known: Signature, scenes: frozenset[str], sign: 
     total, right = 0.0, Trace(frozenset())
     for array, trace in found.items():
         other = known.get(array, right)
-        ours, theirs = trace.wrong_in & scenes, other.wrong_in & scenes
+        ours, theirs = trace.check_step & scenes, other.check_step & scenes
         if not ours | theirs:
             continue
         n_differing = len(ours ^ theirs)
@@ -182,7 +182,7 @@ def likeliest(found: Signature, scenes: Sequence[str], *, is_fed: bool, n: int =
     table = known_signatures("fed" if is_fed else "unfed")
     traces = {array: trace for array, trace in found.items() if array in _arrays_of_faults()}
     common = [scene for scene in scenes if scene in table.scenes]
-    if not common or not any(trace.wrong_in for trace in traces.values()):
+    if not common or not any(trace.check_step for trace in traces.values()):
         return []
     ranked = [
         Likely(what, where, distance(traces, known, common), known) for (what, where), known in table.faults.items()
@@ -211,8 +211,8 @@ def table_of(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str]) -> Table:
     for row in rows:
         traces = {}
         for array, (wrong, size, along, columns) in row["arrays"].items():
-            wrong_in = frozenset(s for s, letter in zip(scenes, wrong, strict=True) if letter == "x")
-            traces[array] = Trace(wrong_in, size, along, tuple(columns))
+            check_step = frozenset(s for s, letter in zip(scenes, wrong, strict=True) if letter == "x")
+            traces[array] = Trace(check_step, size, along, tuple(columns))
         faults[row["what"], row["where"]] = traces
     return Table(tuple(scenes), faults)
 
@@ -225,13 +225,13 @@ def rows_of(table: Table) -> list[dict[str, Any]]:
             "where": where,
             "arrays": {
                 array: [
-                    "".join("x" if scene in trace.wrong_in else "." for scene in table.scenes),
+                    "".join("x" if scene in trace.check_step else "." for scene in table.scenes),
                     round(trace.size, 2),
                     round(trace.along, 2),
                     [round(share, 2) for share in trace.columns],
                 ]
                 for array, trace in known.items()
-                if trace.wrong_in
+                if trace.check_step
             },
         }
         for (what, where), known in table.faults.items()
@@ -257,7 +257,7 @@ def in_words(found: Signature, likely: Sequence[Likely], not_given: Iterable[str
     not_given : iterable of str
         Arrays that the renderer could give and does not.
     """
-    wrong = [array for array, trace in found.items() if trace.wrong_in]
+    wrong = [array for array, trace in found.items() if trace.check_step]
     is_forward = any(SPECS[array].role == "output" for array in wrong)
     role = "output" if is_forward else "gradient"
     right = [a for a in found if a not in wrong and SPECS[a].role == role and a in _arrays_of_faults()]

@@ -11,7 +11,7 @@ from data_tools.claims.kit import Report, records
 from data_tools.claims.kit.claim import RESULT, RESUMED_OUT, SEEDS, declare
 from data_tools.claims.kit.records import HAND_OUT, JOB, handing_out, job_file, one_job, resume
 from minisplat_ref.app.runs import cluster
-from minisplat_ref.interface.arguments import without_workers
+from minisplat_ref.interface.arguments import drop_workers
 
 JOBS = [{"arm": arm, "seed": seed} for seed in (0, 1) for arm in ("a", "b")]
 SETTINGS = {"iterations": 3}
@@ -67,7 +67,7 @@ def test_records_of_other_arguments_are_not_taken_in(tmp_path, in_turn):
 
 def test_words_without_workers():
     words = ["claims", "x", "--workers", "2", "room", "--cluster=tcp://h:1", "--out", "o"]
-    assert without_workers(words) == ["claims", "x", "room", "--out", "o"]
+    assert drop_workers(words) == ["claims", "x", "room", "--out", "o"]
 
 
 def count_seeds(args):

@@ -14,7 +14,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
 
@@ -82,7 +82,7 @@ def test_each_point_is_on_the_ray_of_its_pixel(outdoor, rng):
     """From a surface's Gaussians, small and opaque, in the order in which pixels are counted."""
     is_seen = outdoor.train_depths.ravel() > 0
     surface = true_points(outdoor)[is_seen]
-    gaussians = from_points(surface, np.zeros((len(surface), 3), np.uint8), sh_degree=0)
+    gaussians = gaussians_from_points(surface, np.zeros((len(surface), 3), np.uint8), sh_degree=0)
     points, pixels = depth_types.draw_points(gaussians, outdoor.scene, depth_types.CHOICES["centre"], rng)
     n_pixels = outdoor.train_depths[0].size
     assert len(np.unique(pixels)) == len(pixels) > 0

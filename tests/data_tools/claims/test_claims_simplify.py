@@ -17,7 +17,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import collect_importance, indoor
-from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.initialization import gaussians_from_points
 from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.strategy.simplify import intersection_preserving, most_important, select_mass
 from minisplat_ref.training.loop import train
@@ -37,7 +37,7 @@ def scene_folder(tmp_path_factory):
 def dense_file(scene_folder):
     """A Gaussian at each point, small and opaque, so that many dominate a pixel without any training."""
     scene = load_scene(scene_folder)
-    gaussians = from_points(scene.points, scene.point_colors, sh_degree=1)
+    gaussians = gaussians_from_points(scene.points, scene.point_colors, sh_degree=1)
     small = gaussians._replace(log_scales=gaussians.log_scales - 1, opacity_logits=gaussians.opacity_logits + 4)
     save_ply(scene_folder.parent / "dense.ply", small)
     return scene_folder.parent / "dense.ply"

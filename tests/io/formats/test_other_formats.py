@@ -69,17 +69,17 @@ def one(**changes):
 
 
 def test_the_largest_component_is_left_out():
-    largest, others = levels8.without_largest(np.array([[1.0, 0, 0, 0], [0, -3.0, 0, 0], [1, 1, 1, -2.0]]))
+    largest, others = levels8.drop_largest(np.array([[1.0, 0, 0, 0], [0, -3.0, 0, 0], [1, 1, 1, -2.0]]))
     assert largest.tolist() == [0, 1, 3]
     assert_allclose(others[0], 0.5)
     assert_allclose(others[2], 0.5 - math.sqrt(1 / 14), atol=CLOSED_FORM)  # -1/sqrt(7) / sqrt(2), as the sign changed
-    back = levels8.with_largest(largest, others)
+    back = levels8.restore_largest(largest, others)
     assert_allclose(back[1], [0, 1, 0, 0], atol=CLOSED_FORM)
     assert_allclose(back[2], np.array([-1, -1, -1, 2]) / math.sqrt(7), atol=CLOSED_FORM)
 
 
 def test_opacities_of_0_and_1_have_logits():
-    logits = levels8.logits_of(np.array([0, 51, 255], np.uint8))
+    logits = levels8.decode_logits(np.array([0, 51, 255], np.uint8))
     assert_allclose(1 / (1 + np.exp(-logits)), [0.25 / 255, 0.2, 254.75 / 255], rtol=CLOSED_FORM)
 
 

@@ -29,9 +29,9 @@ from minisplat_ref.training.pace import (
     Cooling,
     Measurement,
     Pace,
-    from_metadata,
     held_out_ids,
-    to_metadata,
+    pace_from_json,
+    pace_to_json,
     trained_ids,
 )
 from minisplat_ref.training.recipe_settings import configure
@@ -337,7 +337,7 @@ def test_continued_byte_for_byte(scene, reports, tmp_path, at):
 
 def test_the_pace_comes_back_from_json(reports):
     pace = reports[1].pace
-    assert from_metadata(json.loads(json.dumps(to_metadata(pace)))) == pace and pace.measurements
+    assert pace_from_json(json.loads(json.dumps(pace_to_json(pace)))) == pace and pace.measurements
 
 
 @pytest.mark.parametrize("pace", [None, {}, {"measurements": [{}]}, 3, {"measurements": [], "decisions": 5}])

@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, Half, weigh
 from minisplat_ref.methods.adaptive.growth import collect_while_growing, grow
-from minisplat_ref.methods.adaptive.pose import rotation_of
+from minisplat_ref.methods.adaptive.pose import displacement_rotation
 from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
-from minisplat_ref.methods.adaptive.sky import Behind, fit_sky, open_pixels, photographs_behind
+from minisplat_ref.methods.adaptive.sky import Behind, fit_sky, open_pixels, sum_photographs
 from minisplat_ref.methods.adaptive.switches import SWITCHES
 from minisplat_ref.metrics import ssim
 from minisplat_ref.rendering import render
@@ -90,7 +90,7 @@ def test_a_sky_is_seen_in_the_direction_of_the_world():
     camera = Camera(ALONG_X, np.zeros(3), 1e6, 1e6, 0.5, 0.5, 1, 1)
     scene = scene_with(view_of(camera))
     behind_the_camera = balls(np.array([[-5.0, 0, 0]]), [0.1], [0.5])
-    (photograph,) = photographs_behind(
+    (photograph,) = sum_photographs(
         state_of(scene, behind_the_camera), iteration_of(scene), {0: np.array([0])}, np.ones(1, bool)
     )
     expected = 0.2820947918 * 0.4886025119 * np.array([0.0, 0.0, -1.0])
@@ -124,7 +124,7 @@ def test_a_sky_is_drawn_towards_zero_by_a_thousandth():
 def test_a_tenth_of_a_decibel_and_one_standard_error_or_two_decibels_and_three(name, gain, standard_error, is_on):
     evidence = Evidence(gain, standard_error, np.zeros((2, 1)))
     rules = settings_of(SWITCHES[name])
-    switch = replace(SWITCHES[name], ask=lambda *_: Answer(evidence, "asked", dict), rival=None)
+    switch = replace(SWITCHES[name], examine=lambda *_: Answer(evidence, "asked", dict), rival=None)
     scene = scene_with(view_of(make_camera(4, 4)))
     state = state_of(scene, balls(np.array([[0.0, 0, 5]]), [0.1], [0.5]))
     switch(state, iteration_of(scene), **rules)
@@ -141,7 +141,7 @@ def test_amounts_are_drawn_towards_zero_by_a_thousandth():
 def test_a_displacement_is_a_rotation_by_its_own_focal_length():
     """4 px to the right at f_x = 40 are 0.1 about y; 8 px down at f_y = 160 are -0.05 about x."""
     camera = make_camera(fx=40.0, fy=160.0)
-    assert_allclose(rotation_of(camera, np.array([4.0, 8.0])), [-0.05, 0.1, 0.0])
+    assert_allclose(displacement_rotation(camera, np.array([4.0, 8.0])), [-0.05, 0.1, 0.0])
 
 
 # Measurement ----------------------------------------------------------------------------------------------------------

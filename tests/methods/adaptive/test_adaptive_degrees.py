@@ -15,9 +15,9 @@ from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods.adaptive.degrees import (
     SEEN,
     cut_degrees_when_cooling,
+    drop_idle_degrees,
     highest_degree,
     raise_degrees,
-    without_idle_degrees,
 )
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
@@ -83,7 +83,7 @@ def gray(**rest):
 
 def cut(gaussians, degree, least, views):
     is_seen = np.ones((1, len(views)), bool)
-    return without_idle_degrees(gaussians, np.array([degree], np.uint8), views, is_seen, least)
+    return drop_idle_degrees(gaussians, np.array([degree], np.uint8), views, is_seen, least)
 
 
 def test_variation_by_hand():
@@ -119,7 +119,7 @@ def test_only_seen_directions_count():
     """From one side alone there is nothing that varies."""
     views, g = around(12, 1.0), gray(k2=1.0)
     is_seen = np.arange(12)[None] == 3
-    _, degrees = without_idle_degrees(g, np.array([1], np.uint8), views, is_seen, 1e-6)
+    _, degrees = drop_idle_degrees(g, np.array([1], np.uint8), views, is_seen, 1e-6)
     assert degrees.tolist() == [0]
 
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.methods.adaptive.evidence import Evidence, Half, displacements, halves_of, slopes, weigh
-from minisplat_ref.methods.adaptive.pose import hold_mean_pose, rotation_of, turn_held_out
+from minisplat_ref.methods.adaptive.evidence import Evidence, Half, displacements, slopes, split_halves, weigh
+from minisplat_ref.methods.adaptive.pose import displacement_rotation, hold_mean_pose, turn_held_out
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.switches import switch_pose_on
 from minisplat_ref.rendering import render
@@ -47,7 +47,7 @@ def test_evidence_is_told_in_words():
 
 def test_a_field_of_zeros_explains_nothing():
     residual, fields = np.ones((4, 6, 3)), np.zeros((1, 4, 6, 3))
-    left, right = halves_of(residual, fields, np.ones((4, 6), bool))
+    left, right = split_halves(residual, fields, np.ones((4, 6), bool))
     assert_array_equal(left.fitted(), [0.0])
     assert left.energy == right.energy == 36.0
 
@@ -57,7 +57,7 @@ def test_masked_pixels_are_in_neither_half():
     residual, fields = rng.normal(size=(4, 6, 3)), rng.normal(size=(2, 4, 6, 3))
     mask = rng.random((4, 6)) < 0.5
     poisoned = np.where(mask[..., None], residual, np.nan)
-    for half, other in zip(halves_of(poisoned, fields, mask), halves_of(residual, fields, mask), strict=True):
+    for half, other in zip(split_halves(poisoned, fields, mask), split_halves(residual, fields, mask), strict=True):
         assert_array_equal(half.normal, other.normal)
         assert half.energy == other.energy
 
@@ -86,7 +86,7 @@ def test_photographs_one_pixel_wide_or_high_are_trained_on(size, rng):
 def photographs_of(x, noise, rng):
     """Halves of photographs whose residuals are ``x`` [V] times a field of ones, and noise."""
     return [
-        halves_of(value + noise * rng.normal(size=(8, 8, 3)), np.ones((1, 8, 8, 3)), np.ones((8, 8), bool))
+        split_halves(value + noise * rng.normal(size=(8, 8, 3)), np.ones((1, 8, 8, 3)), np.ones((8, 8), bool))
         for value in x
     ]
 
@@ -113,7 +113,7 @@ def test_where_next_to_nothing_is_drawn_no_amount_is_read_from_noise():
     """A half whose field is a thousandth of the others' would say x = 1000 without a ridge."""
     rng = np.random.default_rng(0)
     photographs = photographs_of(np.zeros(12), 0.1, rng)
-    faint = halves_of(np.ones((8, 8, 3)), np.full((1, 8, 8, 3), 1e-3), np.ones((8, 8), bool))
+    faint = split_halves(np.ones((8, 8, 3)), np.full((1, 8, 8, 3), 1e-3), np.ones((8, 8), bool))
     evidence = weigh([*photographs, faint])
     assert np.abs(evidence.fitted).max() < 2.0 and evidence.gain < 0.05
 
@@ -144,7 +144,7 @@ def scene_of(truth, pixels):
     rng, views = np.random.default_rng(1), []
     for i, displacement in enumerate(pixels):
         camera = make_camera(48, 32, rng=rng)
-        seen_by = turned(camera, rotation_of(camera, displacement))
+        seen_by = turned(camera, displacement_rotation(camera, displacement))
         image = render(truth, seen_by, background=BACKGROUND, backend=CPU)[0].image
         bytes_ = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
         views.append(View(f"view{i}", camera, bytes_, None, view_id=i))
@@ -183,7 +183,7 @@ def test_wrong_poses_are_refined_from_their_displacements(disturbed, truth, pixe
     switch_pose_on(state, iteration, min_pose_gain=0.05)
     ids, held = trained_ids(N_VIEWS, ADAPTIVE.cooling, Pace()), held_out_ids(N_VIEWS, 8)
     relative = pixels[ids] - pixels[ids].mean(axis=0)
-    expected = [rotation_of(disturbed.train_views[i].camera, d) for i, d in zip(ids, relative, strict=True)]
+    expected = [displacement_rotation(disturbed.train_views[i].camera, d) for i, d in zip(ids, relative, strict=True)]
     focal = disturbed.train_views[0].camera.fx
     assert_allclose(state.shared[ROTATIONS][ids] * focal, np.array(expected) * focal, atol=DISPLACEMENT_PX)
     assert not state.shared[ROTATIONS][held].any() and not state.shared[SHIFTS].any()
@@ -198,7 +198,7 @@ def test_held_out_views_are_turned_to_the_scene(disturbed, truth, pixels):
     for index in held_out_ids(N_VIEWS, 8):
         camera = disturbed.train_views[index].camera
         found = state.shared[ROTATIONS][index] * camera.fx
-        assert_allclose(found, rotation_of(camera, pixels[index]) * camera.fx, atol=DISPLACEMENT_PX)
+        assert_allclose(found, displacement_rotation(camera, pixels[index]) * camera.fx, atol=DISPLACEMENT_PX)
 
 
 def test_the_mean_correction_stays_zero_in_the_world(disturbed, truth):
