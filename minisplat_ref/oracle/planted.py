@@ -1,4 +1,4 @@
-"""Would an error be found? Backends that are wrong in one formula, on purpose.
+"""Backends that are wrong in one formula, on purpose: they show that a check would find the error.
 
 Most of these errors occurred in renderers that people use; the others are classic mistakes. Each wraps one stage of a
 given backend, so that the same error can be planted in the reference and in the kernels. An error in a forward formula
@@ -14,27 +14,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import SH_C2, Conventions
+from minisplat_ref.constants import SH_C2
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.projection import project_vjp as reference_project_vjp
 from minisplat_ref.rendering.backends import CPU, Backend
-from minisplat_ref.rendering.stages import CompositeVjp
 from minisplat_ref.types import (
     Camera,
     CompositeGradient,
     Floats,
-    Ints,
     PrimitiveGradient,
     Projection,
-    ProjectionGradient,
-    RenderOutput,
     SHGradient,
     TileBins,
-    TileGrid,
 )
 
 Change = Callable[[Backend], Backend]
+Stage = Any
+"""A function of a backend; its arguments are those of its protocol in :mod:`minisplat_ref.rendering.stages`."""
 
 
 class Planted(NamedTuple):
@@ -81,59 +78,64 @@ def plant(name: str, backend: Backend = CPU) -> Backend:
     raise InputError(f"planted error {name!r} is unknown; choose one of {', '.join(e.name for e in PLANTED)}")
 
 
+def change_stages(base: Backend, **changes: Callable[..., Any]) -> Backend:
+    """Return a backend in which some stages are changed.
+
+    Parameters
+    ----------
+    base : Backend
+        The one that is changed.
+    **changes : callable
+        By the name of a stage: ``change(stage, *args, **named)`` is computed in place of ``stage(*args, **named)``.
+    """
+
+    def wrap(stage: Stage, change: Callable[..., Any]) -> Stage:
+        @wraps(stage)
+        def changed(*args: Any, **named: Any) -> Any:
+            return change(stage, *args, **named)
+
+        return changed
+
+    return replace(base, **{name: wrap(getattr(base, name), change) for name, change in changes.items()})
+
+
+def change_camera(base: Backend, change: Callable[[Camera], Camera]) -> Backend:
+    """Return a backend that projects by another camera."""
+
+    def project(stage: Stage, *args: Any) -> Any:
+        return stage(*args[:4], change(args[4]), *args[5:])
+
+    return change_stages(base, project=project, project_vjp=project)
+
+
 def _corner_pixels(base: Backend) -> Backend:
-    @wraps(base.project)
-    def project(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
-    ) -> Projection:
-        return base.project(means, quats, scales, opacities, _shift(camera), conventions)
-
-    @wraps(base.project_vjp)
-    def project_vjp(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any, **named: Any
-    ) -> PrimitiveGradient:
-        return base.project_vjp(means, quats, scales, opacities, _shift(camera), *rest, **named)
-
-    return replace(base, project=project, project_vjp=project_vjp)
-
-
-def _shift(camera: Camera) -> Camera:
-    return camera._replace(cx=camera.cx - 0.5, cy=camera.cy - 0.5)
+    return change_camera(base, lambda camera: camera._replace(cx=camera.cx - 0.5, cy=camera.cy - 0.5))
 
 
 def _transposed_view(base: Backend) -> Backend:
     """With means R R mu and the rotation R^T, a point's camera coordinates are still R mu + t: only J R^T differs."""
 
-    def turned(means: Floats, camera: Camera) -> tuple[Floats, Camera, Floats]:
+    def turn(means: Floats, camera: Camera) -> tuple[Floats, Camera, Floats]:
         R = np.asarray(camera.cam_from_world_R, means.dtype)
         return means @ (R @ R).T, camera._replace(cam_from_world_R=R.T.copy()), R
 
-    @wraps(base.project)
-    def project(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
-    ) -> Projection:
-        turned_means, turned_camera, _ = turned(means, camera)
-        return base.project(turned_means, quats, scales, opacities, turned_camera, conventions)
+    def project(stage: Stage, means: Floats, *args: Any) -> Projection:
+        turned_means, turned_camera, _ = turn(means, args[3])
+        return stage(turned_means, *args[:3], turned_camera, *args[4:])
 
-    @wraps(base.project_vjp)
-    def project_vjp(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any, **named: Any
-    ) -> PrimitiveGradient:
-        turned_means, turned_camera, R = turned(means, camera)
-        v = base.project_vjp(turned_means, quats, scales, opacities, turned_camera, *rest, **named)
+    def project_vjp(stage: Stage, means: Floats, *args: Any) -> PrimitiveGradient:
+        turned_means, turned_camera, R = turn(means, args[3])
+        v = stage(turned_means, *args[:3], turned_camera, *args[4:])
         v_RR = v.means.T @ means
         v_R = v.cam_from_world_R.T + v_RR @ R.T + R.T @ v_RR
         return v._replace(means=v.means @ (R @ R), cam_from_world_R=v_R)
 
-    return replace(base, project=project, project_vjp=project_vjp)
+    return change_stages(base, project=project, project_vjp=project_vjp)
 
 
 def _three_sigma(base: Backend) -> Backend:
-    @wraps(base.project)
-    def project(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
-    ) -> Projection:
-        p = base.project(means, quats, scales, opacities, camera, conventions)
+    def project(stage: Stage, *args: Any) -> Projection:
+        p, camera = stage(*args), args[4]
         a, b, c = np.where(p.radii[:, :1] > 0, p.conics, (1, 0, 1)).T  # [N]; rows that are culled stay so
         sigmas = np.sqrt(np.column_stack([c, a]) / (a * c - b * b)[:, None])
         radii = np.minimum(p.radii, np.ceil(3 * sigmas)).astype(np.int32)
@@ -142,103 +144,66 @@ def _three_sigma(base: Backend) -> Backend:
         boxes = np.where(radii[:, :1] > 0, np.hstack([low, high]), 0).astype(np.int32)
         return p._replace(radii=radii, boxes=boxes)
 
-    return replace(base, project=project)
+    return change_stages(base, project=project)
 
 
 def _negated_band(base: Backend) -> Backend:
-    def negated(sh_rest: Floats) -> Floats:
+    def negate(sh_rest: Floats) -> Floats:
         flipped = sh_rest.copy()
         flipped[:, 4:5] *= -1  # Y_2-1, the second of degree 2, where there is one
         return flipped
 
-    @wraps(base.sh_colors)
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any, **named: Any) -> Floats:
-        return base.sh_colors(means, sh_dc, negated(sh_rest), *rest, **named)
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> Floats:
+        return stage(means, sh_dc, negate(sh_rest), *rest)
 
-    @wraps(base.sh_colors_vjp)
-    def sh_colors_vjp(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any, **named: Any) -> SHGradient:
-        v = base.sh_colors_vjp(means, sh_dc, negated(sh_rest), *rest, **named)
-        return v._replace(sh_rest=negated(v.sh_rest))
+    def sh_colors_vjp(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> SHGradient:
+        v = stage(means, sh_dc, negate(sh_rest), *rest)
+        return v._replace(sh_rest=negate(v.sh_rest))
 
-    return replace(base, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
+    return change_stages(base, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
 
 
 def _unsorted_depth(base: Backend) -> Backend:
-    @wraps(base.bin_gaussians)
-    def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
-        keys = np.roll(projection.depths, 1)
-        return base.bin_gaussians(projection._replace(depths=keys), grid, conventions)
+    def bin_gaussians(stage: Stage, projection: Projection, *rest: Any) -> TileBins:
+        return stage(projection._replace(depths=np.roll(projection.depths, 1)), *rest)
 
-    return replace(base, bin_gaussians=bin_gaussians)
+    return change_stages(base, bin_gaussians=bin_gaussians)
+
+
+def _blend_by(**changes: Any) -> Callable[..., Any]:
+    """Return a change of a compositing stage: other conventions."""
+
+    def blend(stage: Stage, *args: Any, **named: Any) -> Any:
+        return stage(*args[:4], args[4]._replace(**changes), *args[5:], **named)
+
+    return blend
 
 
 def _clamp(alpha_max: float) -> Change:
-    def plant(base: Backend) -> Backend:
-        @wraps(base.composite)
-        def composite(
-            projection: Projection,
-            colors: Floats,
-            background: Floats,
-            bins: TileBins,
-            conventions: Conventions,
-            **asked: bool,
-        ) -> RenderOutput:
-            conventions = conventions._replace(alpha_max=alpha_max)
-            return base.composite(projection, colors, background, bins, conventions, **asked)
-
-        return replace(base, composite=composite, composite_vjp=_with_conventions(base, alpha_max=alpha_max))
-
-    return plant
-
-
-def _with_conventions(base: Backend, **changes: Any) -> CompositeVjp:
-    @wraps(base.composite_vjp)
-    def composite_vjp(
-        projection: Projection,
-        colors: Floats,
-        background: Floats,
-        bins: TileBins,
-        conventions: Conventions,
-        *rest: Any,
-        **named: Any,
-    ) -> CompositeGradient:
-        conventions = conventions._replace(**changes)
-        return base.composite_vjp(projection, colors, background, bins, conventions, *rest, **named)
-
-    return composite_vjp
+    blend = _blend_by(alpha_max=alpha_max)
+    return lambda base: change_stages(base, composite=blend, composite_vjp=blend)
 
 
 def _unclamped_mean_gradient(base: Backend) -> Backend:
-    return replace(base, composite_vjp=_with_conventions(base, clamp_stops_mean_gradient=False))
+    return change_stages(base, composite_vjp=_blend_by(clamp_stops_mean_gradient=False))
 
 
 def _half_off_diagonal(base: Backend) -> Backend:
-    @wraps(base.composite_vjp)
-    def composite_vjp(*args: Any, **named: Any) -> CompositeGradient:
-        v = base.composite_vjp(*args, **named)
+    def composite_vjp(stage: Stage, *args: Any) -> CompositeGradient:
+        v = stage(*args)
         return v._replace(conics=v.conics * np.array([1, 0.5, 1], v.conics.dtype))
 
-    return replace(base, composite_vjp=composite_vjp)
+    return change_stages(base, composite_vjp=composite_vjp)
 
 
 def _forgotten_background(base: Backend) -> Backend:
     """dL/dT_end is ``v . background - v_alpha``, so this v_alpha takes the first term out."""
 
-    @wraps(base.composite_vjp)
-    def composite_vjp(
-        projection: Projection,
-        colors: Floats,
-        background: Floats,
-        bins: TileBins,
-        conventions: Conventions,
-        output: RenderOutput,
-        v_image: Floats,
-        v_alpha: Floats,
-    ) -> CompositeGradient:
-        v_alpha = v_alpha + v_image @ background
-        return base.composite_vjp(projection, colors, background, bins, conventions, output, v_image, v_alpha)
+    def composite_vjp(stage: Stage, *args: Any) -> CompositeGradient:
+        background, v_image, v_alpha = args[2], args[6], args[7]
+        return stage(*args[:7], v_alpha + v_image @ background)
 
-    return replace(base, composite_vjp=composite_vjp)
+    return change_stages(base, composite_vjp=composite_vjp)
 
 
 def _transposed_rs(base: Backend) -> Backend:
@@ -252,51 +217,35 @@ def _transposed_rs(base: Backend) -> Backend:
     names = {**reference_project_vjp.__globals__, "covariances_vjp": covariances_vjp}
     changed = FunctionType(reference_project_vjp.__code__, names)
 
-    @wraps(base.project_vjp)
-    def project_vjp(means: Floats, *rest: Any, **named: Any) -> PrimitiveGradient:
-        return PrimitiveGradient._make(field.astype(means.dtype) for field in changed(means, *rest, **named))
+    def project_vjp(stage: Stage, means: Floats, *rest: Any) -> PrimitiveGradient:
+        return PrimitiveGradient._make(field.astype(means.dtype) for field in changed(means, *rest))
 
-    return replace(base, project_vjp=project_vjp)
+    return change_stages(base, project_vjp=project_vjp)
 
 
-def _changed_project_vjp(change: Callable[[PrimitiveGradient, Floats], PrimitiveGradient]) -> Change:
-    def plant(base: Backend) -> Backend:
-        @wraps(base.project_vjp)
-        def project_vjp(means: Floats, quats: Floats, *rest: Any, **named: Any) -> PrimitiveGradient:
-            return change(base.project_vjp(means, quats, *rest, **named), quats)
+def _change_project_vjp(change: Callable[[PrimitiveGradient, Floats], PrimitiveGradient]) -> Change:
+    """Return an error of the gradient of the projection: ``change(v, quats)``."""
 
-        return replace(base, project_vjp=project_vjp)
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
+        return change(stage(*args), args[1])
 
-    return plant
+    return lambda base: change_stages(base, project_vjp=project_vjp)
 
 
 def _forgotten_depth(base: Backend) -> Backend:
-    @wraps(base.project_vjp)
-    def project_vjp(
-        means: Floats,
-        quats: Floats,
-        scales: Floats,
-        opacities: Floats,
-        camera: Camera,
-        conventions: Conventions,
-        projection: Projection,
-        v_projection: ProjectionGradient,
-    ) -> PrimitiveGradient:
-        v_projection = v_projection._replace(depths=np.zeros_like(v_projection.depths))
-        return base.project_vjp(means, quats, scales, opacities, camera, conventions, projection, v_projection)
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
+        v_projection = args[7]
+        return stage(*args[:7], v_projection._replace(depths=np.zeros_like(v_projection.depths)))
 
-    return replace(base, project_vjp=project_vjp)
+    return change_stages(base, project_vjp=project_vjp)
 
 
 def _frozen_direction(base: Backend) -> Backend:
-    @wraps(base.sh_colors_vjp)
-    def sh_colors_vjp(
-        means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints, v_colors: Floats
-    ) -> SHGradient:
-        v = base.sh_colors_vjp(means, sh_dc, sh_rest, camera, degree, radii, v_colors)
+    def sh_colors_vjp(stage: Stage, *args: Any) -> SHGradient:
+        v = stage(*args)
         return v._replace(means=np.zeros_like(v.means))
 
-    return replace(base, sh_colors_vjp=sh_colors_vjp)
+    return change_stages(base, sh_colors_vjp=sh_colors_vjp)
 
 
 PLANTED = (
@@ -314,7 +263,7 @@ PLANTED = (
         "unit-quats-assumed",
         "v_quats",
         "v_q not divided by |q|",
-        _changed_project_vjp(
+        _change_project_vjp(
             lambda v, quats: v._replace(
                 quats=v.quats * np.linalg.norm(quats, axis=1, keepdims=True).astype(quats.dtype)
             )
@@ -324,7 +273,7 @@ PLANTED = (
         "transposed-pose",
         "v_R",
         "gradient of the view rotation transposed",
-        _changed_project_vjp(lambda v, q: v._replace(cam_from_world_R=v.cam_from_world_R.T.copy())),
+        _change_project_vjp(lambda v, q: v._replace(cam_from_world_R=v.cam_from_world_R.T.copy())),
     ),
     Planted("depth-forgotten", "v_means", "gradient of the depths not handed on to the means", _forgotten_depth),
     Planted("direction-frozen", "v_means", "colours do not move with the viewing direction", _frozen_direction),

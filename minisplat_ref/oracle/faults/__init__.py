@@ -23,7 +23,6 @@ from minisplat_ref.oracle.faults.forward import (
     with_bands,
     with_blended_conics,
     with_blended_opacities,
-    with_camera,
     with_conics,
     with_directions_from_the_origin,
     with_distances,
@@ -38,7 +37,8 @@ from minisplat_ref.oracle.faults.forward import (
     without_highest_band,
     without_rotation,
 )
-from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.oracle.planted import change_camera
+from minisplat_ref.rendering.backends import REFERENCE, Backend
 
 
 class Fault(NamedTuple):
@@ -56,24 +56,29 @@ class Fault(NamedTuple):
     """Further sizes, at which the signatures are judged."""
 
 
-_FACTORS = (0.8, 1.5, -1.0)  # of a gradient whose signature is measured at one half
+def _scaled(what: str, where: str, stage: str, *fields: str, columns: tuple[float, ...] | None = None) -> Fault:
+    """Return the fault of gradients that are off by a factor; the signature is measured at one half."""
+    return Fault(what, where, scale_gradient(stage, *fields, columns=columns), 0.5, (0.8, 1.5, -1.0))
+
 
 FAULTS = (
     Fault(
         "pixel centres that are off",
         "projection",
-        lambda d: with_camera(lambda c: c._replace(cx=c.cx - d, cy=c.cy - d)),
+        lambda d: change_camera(REFERENCE, lambda c: c._replace(cx=c.cx - d, cy=c.cy - d)),
         0.5,
         (0.25, 0.05),
     ),
     Fault(
         "a focal length that is off",
         "projection",
-        lambda d: with_camera(lambda c: c._replace(fx=c.fx * (1 + d), fy=c.fy * (1 + d))),
+        lambda d: change_camera(REFERENCE, lambda c: c._replace(fx=c.fx * (1 + d), fy=c.fy * (1 + d))),
         0.02,
         (0.005, -0.1),
     ),
-    Fault("fx and fy exchanged", "projection", lambda _: with_camera(lambda c: c._replace(fx=c.fy, fy=c.fx))),
+    Fault(
+        "fx and fy exchanged", "projection", lambda _: change_camera(REFERENCE, lambda c: c._replace(fx=c.fy, fy=c.fx))
+    ),
     Fault("the view's rotation transposed in J R", "projection", as_planted("transposed-view")),
     Fault(
         "another low-pass",
@@ -155,48 +160,20 @@ FAULTS = (
         (0.8, -1.0),
     ),
     Fault("opacities off by a factor in alpha", "blending", with_blended_opacities, 0.9, (0.98, 0.5)),
-    Fault(
-        "the gradient of the centres off by a factor",
-        "gradient of blending",
-        scale_gradient("composite_vjp", "means2d"),
-        0.5,
-        _FACTORS,
-    ),
-    Fault(
+    _scaled("the gradient of the centres off by a factor", "gradient of blending", "composite_vjp", "means2d"),
+    _scaled(
         "the gradient of the conic's off-diagonal halved, or off by another factor",
         "gradient of blending",
-        scale_gradient("composite_vjp", "conics", columns=(0, 1, 0)),
-        0.5,
-        _FACTORS,
+        "composite_vjp",
+        "conics",
+        columns=(0, 1, 0),
     ),
-    Fault(
-        "the gradient of the conics off by a factor",
-        "gradient of blending",
-        scale_gradient("composite_vjp", "conics"),
-        0.5,
-        _FACTORS,
+    _scaled("the gradient of the conics off by a factor", "gradient of blending", "composite_vjp", "conics"),
+    _scaled(
+        "the gradient of the blended opacities off by a factor", "gradient of blending", "composite_vjp", "opacities"
     ),
-    Fault(
-        "the gradient of the blended opacities off by a factor",
-        "gradient of blending",
-        scale_gradient("composite_vjp", "opacities"),
-        0.5,
-        _FACTORS,
-    ),
-    Fault(
-        "the gradient of the blended colours off by a factor",
-        "gradient of blending",
-        scale_gradient("composite_vjp", "colors"),
-        0.5,
-        _FACTORS,
-    ),
-    Fault(
-        "the gradient of the background off by a factor",
-        "gradient of blending",
-        scale_gradient("composite_vjp", "background"),
-        0.5,
-        _FACTORS,
-    ),
+    _scaled("the gradient of the blended colours off by a factor", "gradient of blending", "composite_vjp", "colors"),
+    _scaled("the gradient of the background off by a factor", "gradient of blending", "composite_vjp", "background"),
     Fault("clamped alpha that hands its gradient on", "gradient of blending", as_planted("mean-gradient-unclamped")),
     Fault(
         "the background forgotten in the gradient of alpha", "gradient of blending", as_planted("background-forgotten")
@@ -225,42 +202,18 @@ FAULTS = (
     ),
     Fault("the gradient of the depths forgotten", "gradient of projection", with_v_depths, 0.0, (0.5, -1.0)),
     Fault("S R for R S in the covariance's gradient", "gradient of projection", as_planted("transposed-rs")),
-    Fault(
-        "the covariance's gradient off by a factor",
-        "gradient of projection",
-        scale_gradient("project_vjp", "quats", "scales"),
-        0.5,
-        _FACTORS,
-    ),
+    _scaled("the covariance's gradient off by a factor", "gradient of projection", "project_vjp", "quats", "scales"),
     Fault(
         "the quaternion's length left out of its gradient", "gradient of projection", as_planted("unit-quats-assumed")
     ),
-    Fault(
-        "the gradient of the quaternions off by a factor",
-        "gradient of projection",
-        scale_gradient("project_vjp", "quats"),
-        0.5,
-        _FACTORS,
-    ),
-    Fault(
-        "the gradient of the scales off by a factor",
-        "gradient of projection",
-        scale_gradient("project_vjp", "scales"),
-        0.5,
-        _FACTORS,
-    ),
+    _scaled("the gradient of the quaternions off by a factor", "gradient of projection", "project_vjp", "quats"),
+    _scaled("the gradient of the scales off by a factor", "gradient of projection", "project_vjp", "scales"),
     Fault(
         "the gradient by log scales in place of scales",
         "gradient of projection",
         lambda _: changed_project_vjp(lambda v, a: v._replace(scales=v.scales * a[2])),
     ),
-    Fault(
-        "the gradient of the opacities off by a factor",
-        "gradient of projection",
-        scale_gradient("project_vjp", "opacities"),
-        0.5,
-        _FACTORS,
-    ),
+    _scaled("the gradient of the opacities off by a factor", "gradient of projection", "project_vjp", "opacities"),
     Fault(
         "the gradient by logits in place of opacities",
         "gradient of projection",
@@ -272,19 +225,17 @@ FAULTS = (
         lambda _: changed_project_vjp(lambda v, a: v._replace(means=v.means @ a[4].cam_from_world_R.T)),
     ),
     Fault("the gradient of the view's rotation transposed", "gradient of projection", as_planted("transposed-pose")),
-    Fault(
+    _scaled(
         "the gradient of the view's rotation off by a factor",
         "gradient of projection",
-        scale_gradient("project_vjp", "cam_from_world_R"),
-        0.5,
-        _FACTORS,
+        "project_vjp",
+        "cam_from_world_R",
     ),
-    Fault(
+    _scaled(
         "the gradient of the view's translation off by a factor",
         "gradient of projection",
-        scale_gradient("project_vjp", "cam_from_world_t"),
-        0.5,
-        _FACTORS,
+        "project_vjp",
+        "cam_from_world_t",
     ),
     Fault(
         "colours that do not move with the viewing direction",
@@ -307,19 +258,7 @@ FAULTS = (
         0.0,
         (0.5, -1.0),
     ),
-    Fault(
-        "the gradient of the base colour off by a factor",
-        "gradient of colours",
-        scale_gradient("sh_colors_vjp", "sh_dc"),
-        0.5,
-        _FACTORS,
-    ),
-    Fault(
-        "the gradient of the harmonics off by a factor",
-        "gradient of colours",
-        scale_gradient("sh_colors_vjp", "sh_rest"),
-        0.5,
-        _FACTORS,
-    ),
+    _scaled("the gradient of the base colour off by a factor", "gradient of colours", "sh_colors_vjp", "sh_dc"),
+    _scaled("the gradient of the harmonics off by a factor", "gradient of colours", "sh_colors_vjp", "sh_rest"),
 )
 """In the order of the pipeline, forward before backward."""

@@ -1,13 +1,13 @@
 """Backends with right images and a wrong gradient, whose error has a given size."""
 
 from collections.abc import Callable
-from functools import wraps
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.oracle.faults.forward import RIGHT, rebuilt, with_stages
-from minisplat_ref.oracle.planted import plant
+from minisplat_ref.oracle.faults.forward import rebuilt
+from minisplat_ref.oracle.planted import Stage, change_stages, plant
 from minisplat_ref.reference import projection as reference_projection
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import CompositeGradient, PrimitiveGradient, ProjectionGradient
@@ -18,14 +18,12 @@ def scale_gradient(stage: str, *fields: str, columns: tuple[float, ...] | None =
 
     def plant_factor(factor: float) -> Backend:
         by: Any = factor if columns is None else np.where(np.array(columns) == 1, factor, 1.0)
-        right = getattr(RIGHT, stage)
 
-        @wraps(right)
-        def wrong(*args: Any) -> Any:
+        def scale(right: Stage, *args: Any) -> Any:
             v = right(*args)
             return v._replace(**{field: (getattr(v, field) * by).astype(getattr(v, field).dtype) for field in fields})
 
-        return with_stages(**{stage: wrong})
+        return change_stages(REFERENCE, **{stage: scale})
 
     return plant_factor
 
@@ -33,32 +31,29 @@ def scale_gradient(stage: str, *fields: str, columns: tuple[float, ...] | None =
 def changed_project_vjp(change: Callable[[PrimitiveGradient, tuple[Any, ...]], PrimitiveGradient]) -> Backend:
     """Return a backend whose gradient of the projection is changed; the change also gets the arguments."""
 
-    @wraps(RIGHT.project_vjp)
-    def project_vjp(*args: Any) -> PrimitiveGradient:
-        return change(RIGHT.project_vjp(*args), args)
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
+        return change(stage(*args), args)
 
-    return with_stages(project_vjp=project_vjp)
+    return change_stages(REFERENCE, project_vjp=project_vjp)
 
 
 def with_v_alpha(factor: float) -> Backend:
     """Return a backend that multiplies the derivative with respect to alpha's image."""
 
-    @wraps(RIGHT.composite_vjp)
-    def composite_vjp(*args: Any) -> CompositeGradient:
-        return RIGHT.composite_vjp(*args[:-1], factor * args[-1])
+    def composite_vjp(stage: Stage, *args: Any) -> CompositeGradient:
+        return stage(*args[:-1], factor * args[-1])
 
-    return with_stages(composite_vjp=composite_vjp)
+    return change_stages(REFERENCE, composite_vjp=composite_vjp)
 
 
 def with_v_depths(factor: float) -> Backend:
     """Return a backend that multiplies the derivative with respect to the depths."""
 
-    @wraps(RIGHT.project_vjp)
-    def project_vjp(*args: Any) -> PrimitiveGradient:
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
         v: ProjectionGradient = args[-1]
-        return RIGHT.project_vjp(*args[:-1], v._replace(depths=factor * v.depths))
+        return stage(*args[:-1], v._replace(depths=factor * v.depths))
 
-    return with_stages(project_vjp=project_vjp)
+    return change_stages(REFERENCE, project_vjp=project_vjp)
 
 
 def scale_share(name: str) -> Callable[[float], Backend]:
@@ -67,7 +62,7 @@ def scale_share(name: str) -> Callable[[float], Backend]:
 
     def plant_factor(factor: float) -> Backend:
         project_vjp = rebuilt(**{name: lambda *args: factor * right(*args)}).project_vjp
-        return with_stages(project_vjp=project_vjp)
+        return replace(REFERENCE, project_vjp=project_vjp)
 
     return plant_factor
 

@@ -3,13 +3,13 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 
 from minisplat_ref.constants import SH_C0
+from minisplat_ref.oracle.planted import Stage, change_stages
 from minisplat_ref.reference import projection as reference_projection
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import (
@@ -22,15 +22,8 @@ from minisplat_ref.types import (
     SHGradient,
 )
 
-RIGHT: Any = REFERENCE  # what is wrapped here has the arguments of a stage, and passes them on
 
-
-def with_stages(**stages: Any) -> Backend:
-    """Return the reference with other stages."""
-    return replace(REFERENCE, **stages)
-
-
-def _of_project(
+def _change_projection(
     change: Callable[..., tuple[Any, ...]], change_back: Callable[[PrimitiveGradient, tuple[Any, ...]], Any]
 ) -> Backend:
     """Return a backend that projects other primitives, or with another camera or conventions.
@@ -39,41 +32,25 @@ def _of_project(
     respect to the latter, and the former, to that with respect to the former.
     """
 
-    @wraps(RIGHT.project)
-    def project(*args: Any) -> Projection:
-        return RIGHT.project(*change(*args))
+    def project(stage: Stage, *args: Any) -> Projection:
+        return stage(*change(*args))
 
-    @wraps(RIGHT.project_vjp)
-    def project_vjp(*args: Any) -> PrimitiveGradient:
-        return change_back(RIGHT.project_vjp(*change(*args[:6]), *args[6:]), args)
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
+        return change_back(stage(*change(*args[:6]), *args[6:]), args)
 
-    return with_stages(project=project, project_vjp=project_vjp)
-
-
-def _unchanged(v: PrimitiveGradient, args: tuple[Any, ...]) -> PrimitiveGradient:
-    return v
-
-
-def with_camera(change: Callable[[Camera], Camera]) -> Backend:
-    """Return a backend that projects by another camera."""
-    return _of_project(lambda *a: (*a[:4], change(a[4]), a[5]), _unchanged)
+    return change_stages(REFERENCE, project=project, project_vjp=project_vjp)
 
 
 def with_rules(change: Callable[[Any], dict[str, Any]]) -> Backend:
     """Return a backend that projects and blends by other conventions."""
 
-    def changed(function: Any) -> Any:
-        position = list(inspect.signature(function).parameters).index("conventions")
-
-        @wraps(function)
-        def wrapped(*args: Any, **named: Any) -> Any:
-            rules = args[position]._replace(**change(args[position]))
-            return function(*args[:position], rules, *args[position + 1 :], **named)
-
-        return wrapped
+    def follow(stage: Stage, *args: Any, **named: Any) -> Any:
+        position = list(inspect.signature(stage).parameters).index("conventions")
+        rules = args[position]._replace(**change(args[position]))
+        return stage(*args[:position], rules, *args[position + 1 :], **named)
 
     names = ("project", "project_vjp", "bin_gaussians", "composite", "composite_vjp")
-    return with_stages(**{name: changed(getattr(RIGHT, name)) for name in names})
+    return change_stages(REFERENCE, **dict.fromkeys(names, follow))
 
 
 def with_scales(factor: float) -> Backend:
@@ -82,7 +59,7 @@ def with_scales(factor: float) -> Backend:
     def change(means: Floats, quats: Floats, scales: Floats, *rest: Any) -> tuple[Any, ...]:
         return means, quats, factor * scales, *rest
 
-    return _of_project(change, lambda v, args: v._replace(scales=factor * v.scales))
+    return _change_projection(change, lambda v, args: v._replace(scales=factor * v.scales))
 
 
 def with_unsquared_scales(_: float) -> Backend:
@@ -91,7 +68,7 @@ def with_unsquared_scales(_: float) -> Backend:
     def change(means: Floats, quats: Floats, scales: Floats, *rest: Any) -> tuple[Any, ...]:
         return means, quats, np.sqrt(scales), *rest
 
-    return _of_project(change, lambda v, args: v._replace(scales=v.scales / (2 * np.sqrt(args[2]))))
+    return _change_projection(change, lambda v, args: v._replace(scales=v.scales / (2 * np.sqrt(args[2]))))
 
 
 def with_unnormalised_quats(_: float) -> Backend:
@@ -104,7 +81,7 @@ def with_unnormalised_quats(_: float) -> Backend:
         squares, along = np.sum(args[1] ** 2, axis=1, keepdims=True), np.sum(v.scales * args[2], axis=1, keepdims=True)
         return v._replace(scales=v.scales * squares, quats=v.quats + 2 * along * args[1])
 
-    return _of_project(change, back)
+    return _change_projection(change, back)
 
 
 def with_rolled_quats(_: float) -> Backend:
@@ -113,7 +90,7 @@ def with_rolled_quats(_: float) -> Backend:
     def change(means: Floats, quats: Floats, *rest: Any) -> tuple[Any, ...]:
         return means, np.roll(quats, 1, axis=1), *rest
 
-    return _of_project(change, lambda v, args: v._replace(quats=np.roll(v.quats, -1, axis=1)))
+    return _change_projection(change, lambda v, args: v._replace(quats=np.roll(v.quats, -1, axis=1)))
 
 
 def without_rotation(_: float) -> Backend:
@@ -122,23 +99,21 @@ def without_rotation(_: float) -> Backend:
     def change(means: Floats, quats: Floats, *rest: Any) -> tuple[Any, ...]:
         return means, np.tile([1.0, 0.0, 0.0, 0.0], (len(quats), 1)).astype(quats.dtype), *rest
 
-    return _of_project(change, lambda v, args: v._replace(quats=np.zeros_like(v.quats)))
+    return _change_projection(change, lambda v, args: v._replace(quats=np.zeros_like(v.quats)))
 
 
 def with_conics(factors: tuple[float, float, float], order: tuple[int, int, int] = (0, 1, 2)) -> Backend:
     """Return a backend whose projection returns other conics."""
 
-    @wraps(RIGHT.project)
-    def project(*args: Any) -> Projection:
-        p = RIGHT.project(*args)
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
         return p._replace(conics=p.conics[:, order] * np.array(factors, p.conics.dtype))
 
-    @wraps(RIGHT.project_vjp)
-    def project_vjp(*args: Any) -> PrimitiveGradient:
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
         v = args[-1]
-        return RIGHT.project_vjp(*args[:-1], v._replace(conics=(v.conics * np.array(factors))[:, order]))
+        return stage(*args[:-1], v._replace(conics=(v.conics * np.array(factors))[:, order]))
 
-    return with_stages(project=project, project_vjp=project_vjp)
+    return change_stages(REFERENCE, project=project, project_vjp=project_vjp)
 
 
 def with_distances(_: float) -> Backend:
@@ -148,16 +123,14 @@ def with_distances(_: float) -> Backend:
         x = means @ camera.cam_from_world_R.T + camera.cam_from_world_t
         return x, np.linalg.norm(x, axis=1)
 
-    @wraps(RIGHT.project)
-    def project(*args: Any) -> Projection:
-        p = RIGHT.project(*args)
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
         return p._replace(depths=np.where(p.depths > 0, distances(args[0], args[4])[1], 0).astype(p.depths.dtype))
 
-    @wraps(RIGHT.project_vjp)
-    def project_vjp(*args: Any) -> PrimitiveGradient:
+    def project_vjp(stage: Stage, *args: Any) -> PrimitiveGradient:
         x, lengths = distances(args[0], args[4])
         v_depths = np.where(args[6].depths > 0, args[7].depths, 0)
-        v = RIGHT.project_vjp(*args[:7], args[7]._replace(depths=np.zeros_like(v_depths)))
+        v = stage(*args[:7], args[7]._replace(depths=np.zeros_like(v_depths)))
         v_x = (v_depths / lengths)[:, None] * x
         return v._replace(
             means=v.means + v_x @ args[4].cam_from_world_R,
@@ -165,7 +138,7 @@ def with_distances(_: float) -> Backend:
             cam_from_world_t=v.cam_from_world_t + v_x.sum(axis=0),
         )
 
-    return with_stages(project=project, project_vjp=project_vjp)
+    return change_stages(REFERENCE, project=project, project_vjp=project_vjp)
 
 
 def rebuilt(**functions: Any) -> Backend:
@@ -176,7 +149,7 @@ def rebuilt(**functions: Any) -> Backend:
         if isinstance(original, FunctionType) and original.__module__ == reference_projection.__name__:
             names[name] = FunctionType(original.__code__, names, name, original.__defaults__)
     names |= functions
-    return with_stages(project=names["project"], project_vjp=names["project_vjp"])
+    return replace(REFERENCE, project=names["project"], project_vjp=names["project_vjp"])
 
 
 def with_slope_limits(factor: float) -> Backend:
@@ -190,20 +163,18 @@ def with_slope_limits(factor: float) -> Backend:
     return rebuilt(slope_limits=slope_limits)
 
 
-def _of_colors(
+def _change_coefficients(
     change: Callable[[Floats, Floats], tuple[Floats, Floats]], back: Callable[[SHGradient], SHGradient]
 ) -> Backend:
     """Return a backend that shades other coefficients."""
 
-    @wraps(RIGHT.sh_colors)
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> Floats:
-        return RIGHT.sh_colors(means, *change(sh_dc, sh_rest), *rest)
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> Floats:
+        return stage(means, *change(sh_dc, sh_rest), *rest)
 
-    @wraps(RIGHT.sh_colors_vjp)
-    def sh_colors_vjp(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> SHGradient:
-        return back(RIGHT.sh_colors_vjp(means, *change(sh_dc, sh_rest), *rest))
+    def sh_colors_vjp(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> SHGradient:
+        return back(stage(means, *change(sh_dc, sh_rest), *rest))
 
-    return with_stages(sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
+    return change_stages(REFERENCE, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
 
 
 def with_bands(factors: Callable[[int], float]) -> Backend:
@@ -213,7 +184,7 @@ def with_bands(factors: Callable[[int], float]) -> Backend:
         degrees = np.floor(np.sqrt(np.arange(1, sh_rest.shape[1] + 1)))
         return sh_rest * np.array([factors(int(degree)) for degree in degrees])[None, :, None].astype(sh_rest.dtype)
 
-    return _of_colors(
+    return _change_coefficients(
         lambda sh_dc, sh_rest: (sh_dc, changed(sh_rest)), lambda v: v._replace(sh_rest=changed(v.sh_rest))
     )
 
@@ -225,12 +196,14 @@ def without_highest_band(_: float) -> Backend:
         degree = round(np.sqrt(sh_rest.shape[1] + 1)) - 1
         return np.where(np.arange(1, sh_rest.shape[1] + 1)[None, :, None] < degree**2, sh_rest, 0)
 
-    return _of_colors(lambda sh_dc, sh_rest: (sh_dc, cut(sh_rest)), lambda v: v._replace(sh_rest=cut(v.sh_rest)))
+    return _change_coefficients(
+        lambda sh_dc, sh_rest: (sh_dc, cut(sh_rest)), lambda v: v._replace(sh_rest=cut(v.sh_rest))
+    )
 
 
 def with_lighter_colors(by: float) -> Backend:
     """Return a backend that adds a constant to colours, before they are clamped."""
-    return _of_colors(lambda sh_dc, sh_rest: (sh_dc + by / SH_C0, sh_rest), lambda v: v)
+    return _change_coefficients(lambda sh_dc, sh_rest: (sh_dc + by / SH_C0, sh_rest), lambda v: v)
 
 
 def with_directions_from_the_origin(_: float) -> Backend:
@@ -239,66 +212,62 @@ def with_directions_from_the_origin(_: float) -> Backend:
     def at_origin(camera: Camera) -> Camera:
         return camera._replace(cam_from_world_t=np.zeros(3))
 
-    @wraps(RIGHT.sh_colors)
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any) -> Floats:
-        return RIGHT.sh_colors(means, sh_dc, sh_rest, at_origin(camera), *rest)
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any) -> Floats:
+        return stage(means, sh_dc, sh_rest, at_origin(camera), *rest)
 
-    @wraps(RIGHT.sh_colors_vjp)
-    def sh_colors_vjp(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any) -> SHGradient:
-        v = RIGHT.sh_colors_vjp(means, sh_dc, sh_rest, at_origin(camera), *rest)
+    def sh_colors_vjp(
+        stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any
+    ) -> SHGradient:
+        v = stage(means, sh_dc, sh_rest, at_origin(camera), *rest)
         nothing = np.zeros_like(v.cam_from_world_R), np.zeros_like(v.cam_from_world_t)
         return v._replace(cam_from_world_R=nothing[0], cam_from_world_t=nothing[1])
 
-    return with_stages(sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
+    return change_stages(REFERENCE, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
 
 
 def with_negative_colors(_: float) -> Backend:
     """Return a backend without the clamp at 0: ``c = 1 - max(0, 1 - c)`` where c is below 0."""
 
-    @wraps(RIGHT.sh_colors)
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> Floats:
-        upper = RIGHT.sh_colors(means, sh_dc, sh_rest, *rest)
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> Floats:
+        upper = stage(means, sh_dc, sh_rest, *rest)
         shown = (rest[-1][:, :1] > 0) & (upper == 0)
-        return np.where(shown, 1 - RIGHT.sh_colors(means, -sh_dc, -sh_rest, *rest), upper)
+        return np.where(shown, 1 - stage(means, -sh_dc, -sh_rest, *rest), upper)
 
-    @wraps(RIGHT.sh_colors_vjp)
-    def sh_colors_vjp(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> SHGradient:
-        upper = RIGHT.sh_colors(means, sh_dc, sh_rest, *rest[:-1])
-        v = RIGHT.sh_colors_vjp(means, sh_dc, sh_rest, *rest)
-        lower = RIGHT.sh_colors_vjp(means, -sh_dc, -sh_rest, *rest[:-1], np.where(upper == 0, -rest[-1], 0))
+    def sh_colors_vjp(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> SHGradient:
+        upper = REFERENCE.sh_colors(means, sh_dc, sh_rest, *rest[:-1])
+        v = stage(means, sh_dc, sh_rest, *rest)
+        lower = stage(means, -sh_dc, -sh_rest, *rest[:-1], np.where(upper == 0, -rest[-1], 0))
         lower = lower._replace(sh_dc=-lower.sh_dc, sh_rest=-lower.sh_rest)
         return SHGradient._make(a + b for a, b in zip(v, lower, strict=True))
 
-    return with_stages(sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
+    return change_stages(REFERENCE, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
 
 
-def _of_composite(
+def _change_footprints(
     change: Callable[[Projection], Projection], back: Callable[[CompositeGradient], CompositeGradient]
 ) -> Backend:
     """Return a backend that blends other footprints."""
 
-    @wraps(RIGHT.composite)
-    def composite(projection: Projection, *rest: Any, **asked: bool) -> RenderOutput:
-        return RIGHT.composite(change(projection), *rest, **asked)
+    def composite(stage: Stage, projection: Projection, *rest: Any, **asked: bool) -> RenderOutput:
+        return stage(change(projection), *rest, **asked)
 
-    @wraps(RIGHT.composite_vjp)
-    def composite_vjp(projection: Projection, *rest: Any) -> CompositeGradient:
-        return back(RIGHT.composite_vjp(change(projection), *rest))
+    def composite_vjp(stage: Stage, projection: Projection, *rest: Any) -> CompositeGradient:
+        return back(stage(change(projection), *rest))
 
-    return with_stages(composite=composite, composite_vjp=composite_vjp)
+    return change_stages(REFERENCE, composite=composite, composite_vjp=composite_vjp)
 
 
 def with_blended_conics(*factors: float) -> Backend:
     """Return a backend that blends conics times three factors."""
     by = np.array(factors)
-    return _of_composite(
+    return _change_footprints(
         lambda p: p._replace(conics=(p.conics * by).astype(p.conics.dtype)), lambda v: v._replace(conics=v.conics * by)
     )
 
 
 def with_blended_opacities(factor: float) -> Backend:
     """Return a backend that blends opacities times a factor."""
-    return _of_composite(
+    return _change_footprints(
         lambda p: p._replace(opacities=p.opacities * p.opacities.dtype.type(factor)),
         lambda v: v._replace(opacities=factor * v.opacities),
     )
@@ -307,23 +276,22 @@ def with_blended_opacities(factor: float) -> Backend:
 def with_background(factor: float) -> Backend:
     """Return a backend with the background times a factor."""
 
-    @wraps(RIGHT.composite)
-    def composite(p: Projection, colors: Floats, background: Floats, *rest: Any, **asked: bool) -> RenderOutput:
-        return RIGHT.composite(p, colors, factor * background, *rest, **asked)
+    def composite(
+        stage: Stage, p: Projection, colors: Floats, background: Floats, *rest: Any, **asked: bool
+    ) -> RenderOutput:
+        return stage(p, colors, factor * background, *rest, **asked)
 
-    @wraps(RIGHT.composite_vjp)
-    def composite_vjp(p: Projection, colors: Floats, background: Floats, *rest: Any) -> CompositeGradient:
-        v = RIGHT.composite_vjp(p, colors, factor * background, *rest)
+    def composite_vjp(stage: Stage, p: Projection, colors: Floats, background: Floats, *rest: Any) -> CompositeGradient:
+        v = stage(p, colors, factor * background, *rest)
         return v._replace(background=factor * v.background)
 
-    return with_stages(composite=composite, composite_vjp=composite_vjp)
+    return change_stages(REFERENCE, composite=composite, composite_vjp=composite_vjp)
 
 
 def sorted_from_behind(_: float) -> Backend:
     """Return a backend that blends the farthest Gaussian first."""
 
-    @wraps(RIGHT.bin_gaussians)
-    def bin_gaussians(projection: Projection, *rest: Any) -> Any:
-        return RIGHT.bin_gaussians(projection._replace(depths=-projection.depths), *rest)
+    def bin_gaussians(stage: Stage, projection: Projection, *rest: Any) -> Any:
+        return stage(projection._replace(depths=-projection.depths), *rest)
 
-    return with_stages(bin_gaussians=bin_gaussians)
+    return change_stages(REFERENCE, bin_gaussians=bin_gaussians)
