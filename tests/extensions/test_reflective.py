@@ -23,7 +23,7 @@ from minisplat_ref.mechanisms.gbuffer.population import (
     with_materials,
 )
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter
-from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render_reflective
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
 from minisplat_ref.mechanisms.gbuffer.tone import tone
 from minisplat_ref.mechanisms.gbuffer.training import shade_by, spread_normals
@@ -77,7 +77,7 @@ def test_albedo_alone_in_white_light_is_plain_surfels(stage, backend, rng):
     plain = g._replace(sh_dc=np.broadcast_to((tone(albedo) - 0.5) / SH_C0, (30, 3)))
     request = Request(np.array([0.3, 0.2, 0.1]), backend=backend)
     expected, _ = SURFELS.render(Model(plain), view_from(camera), request)
-    found, _ = render(model_of(reflective(g, albedo), stage), view_from(camera), request, mirrors=False)
+    found, _ = render_reflective(model_of(reflective(g, albedo), stage), view_from(camera), request, mirrors=False)
     assert expected.alpha.mean() > 0.1
     assert_allclose(found.image, expected.image, atol=PARITY_FLOAT64)
     assert_array_equal(found.alpha, expected.alpha)

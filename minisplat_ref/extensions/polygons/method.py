@@ -9,7 +9,7 @@ from minisplat_ref.extensions.polygons.reference import prepare_meeting
 from minisplat_ref.mechanisms.meshes.fans import turn_balls
 from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
-from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
+from minisplat_ref.mechanisms.rays.renderer import Traced, make_ray_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
@@ -36,7 +36,7 @@ def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
 TRACED = Representation(
     "flat Gaussians in polygons",
     extend=press_flat,
-    renderer=renderer_of(Traced("polygons", polygons_of, tracer_for, spans_vjp)),
+    renderer=make_ray_renderer(Traced("polygons", polygons_of, tracer_for, spans_vjp)),
 )
 
 POLYGONS = GS_ACCEL._replace(name="polygons")

@@ -10,7 +10,7 @@ from minisplat_ref.extensions.rays.kernels import RESPONSE, tree_of
 from minisplat_ref.extensions.rays.reference import prepare_meeting
 from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
-from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
+from minisplat_ref.mechanisms.rays.renderer import Traced, make_ray_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
@@ -40,7 +40,7 @@ def _shapes_vjp(population: Any, gaussians: Whitened, v_maps: Floats) -> tuple[F
 
 
 TRACED = Representation(
-    "gaussians traced by rays", renderer=renderer_of(Traced("rays", _prepare, tracer_for, _shapes_vjp))
+    "gaussians traced by rays", renderer=make_ray_renderer(Traced("rays", _prepare, tracer_for, _shapes_vjp))
 )
 
 RAYS = GS_ACCEL._replace(name="rays")

@@ -130,13 +130,13 @@ TEXTURES = shaded.Materials(read_textures, read_textures_vjp, blend, blend_vjp)
 def render(
     model: Model, view: View, request: Request, visibility: Floats | None = None
 ) -> tuple[RenderOutput, shaded.ReflectiveTape]:
-    """Render a view; see :func:`minisplat_ref.mechanisms.gbuffer.renderer.render`.
+    """Render a view; see :func:`minisplat_ref.mechanisms.gbuffer.renderer.render_reflective`.
 
     Textures are shaded pixel by pixel, whatever stage the model has. The channel ``normal`` is that of the textures.
     """
     stage = np.maximum(model.shared[STAGE], PER_PIXEL) if STAGE in model.shared else None
     deferred = model if stage is None else model._replace(shared={**model.shared, STAGE: stage})
-    return shaded.render(deferred, view, request, visibility, mirrors=True, materials=TEXTURES)
+    return shaded.render_reflective(deferred, view, request, visibility, mirrors=True, materials=TEXTURES)
 
 
 def disc_axes(seen: discs.Seen) -> tuple[Floats, Floats]:
@@ -162,4 +162,4 @@ def _parts(tape: discs.BlendTape) -> tuple[slice, slice]:
     return tape.slices["normal"], slice(first, first + N_CHANNELS - 3)
 
 
-TEXTURED = Renderer("textured surfels", render, shaded.render_vjp, shaded.channels)
+TEXTURED = Renderer("textured surfels", render, shaded.render_reflective_vjp, shaded.channels)

@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from minisplat_ref.mechanisms.tangent.renderer import render, render_vjp
+from minisplat_ref.mechanisms.tangent.renderer import render_planes, render_planes_vjp
 from minisplat_ref.methods.gaussian_splatting import FINE_TUNING
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2
 from minisplat_ref.rendering import SPLATTING, Renderer
@@ -12,7 +12,7 @@ BUFFER = 16  # hits that a pixel sorts in its buffer
 
 HEADSET = Representation(
     "gaussians on tangent planes, sorted in a buffer",
-    renderer=Renderer("vr", partial(render, buffer_size=BUFFER), render_vjp, SPLATTING.channels),
+    renderer=Renderer("vr", partial(render_planes, buffer_size=BUFFER), render_planes_vjp, SPLATTING.channels),
 )
 
 VR = MINI_SPLATTING2._replace(name="vr")

@@ -86,7 +86,7 @@ class _Pixels(NamedTuple):
 
 
 class ReflectiveTape(NamedTuple):
-    """The values that :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render_reflective` keeps for :func:`render_reflective_vjp`."""
 
     model: Model
     seen: discs.Seen
@@ -129,7 +129,7 @@ def _flat_materials_vjp(seen: discs.Seen, v_materials: Floats) -> MaterialGradie
 FLAT = Materials(lambda seen: flat_materials(seen.gaussians), _flat_materials_vjp)
 
 
-def render(
+def render_reflective(
     model: Model,
     view: View,
     request: Request,
@@ -138,7 +138,7 @@ def render(
     mirrors: bool,
     materials: Materials = FLAT,
 ) -> tuple[RenderOutput, ReflectiveTape]:
-    """Render a view of reflective surfels; see :func:`minisplat_ref.mechanisms.surfels.renderer.render`.
+    """Render a view of reflective surfels; see :func:`minisplat_ref.mechanisms.surfels.renderer.render_surfels`.
 
     Parameters
     ----------
@@ -209,8 +209,8 @@ def render(
     )
 
 
-def render_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`, by the chain rule; the visibility of the environment is constant.
+def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render_reflective`, by the chain rule; the visibility of the environment is constant.
 
     Per pixel::
 
@@ -349,4 +349,4 @@ def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
     return v
 
 
-REFLECTIVE = Renderer("reflective surfels", partial(render, mirrors=True), render_vjp, channels)
+REFLECTIVE = Renderer("reflective surfels", partial(render_reflective, mirrors=True), render_reflective_vjp, channels)

@@ -42,9 +42,9 @@ class Traced(NamedTuple):
     scales [N, 3]."""
 
 
-def renderer_of(traced: Traced) -> Renderer:
+def make_ray_renderer(traced: Traced) -> Renderer:
     """Return the renderer that traces a ray through the centre of each pixel."""
-    return Renderer(traced.name, partial(render, traced), render_vjp, SPLATTING.channels)
+    return Renderer(traced.name, partial(trace_view, traced), trace_view_vjp, SPLATTING.channels)
 
 
 class _Tape(NamedTuple):
@@ -63,7 +63,7 @@ class _Tape(NamedTuple):
     blended: BlendedRays
 
 
-def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
+def trace_view(traced: Traced, model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
     """Trace a ray through the centre of each pixel.
 
     Raises
@@ -104,8 +104,8 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
     return output, tape
 
 
-def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
-    """Gradient of :func:`render`.
+def trace_view_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+    """Gradient of :func:`trace_view`.
 
     Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets the closest
     substitute: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so

@@ -134,7 +134,7 @@ class BlendedGradient(NamedTuple):
 
 
 class SurfelTape(NamedTuple):
-    """The values that :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render_surfels` keeps for :func:`render_surfels_vjp`."""
 
     seen: Seen
     sh_degree: int | Ints  # active
@@ -186,7 +186,7 @@ def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tupl
     carried : ndarray of shape (N, K)
         What else each surfel brings along, such as its material.
     request : Request
-        As for :func:`render`.
+        As for :func:`render_surfels`.
 
     Returns
     -------
@@ -254,7 +254,7 @@ def blend_vjp(tape: BlendTape, v_image: Floats, v_alpha: Floats | None) -> Blend
     )
 
 
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, SurfelTape]:
+def render_surfels(model: Model, view: View, request: Request) -> tuple[RenderOutput, SurfelTape]:
     """Render a view of surfels.
 
     Parameters
@@ -287,8 +287,8 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Su
     return output, SurfelTape(seen, sh_degree, tape)
 
 
-def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`, by the chain rule.
+def render_surfels_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render_surfels`, by the chain rule.
 
     The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
     """
@@ -305,5 +305,5 @@ def render_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None = None)
     )
 
 
-SURFELS = Renderer("surfels", render, render_vjp, channels)
+SURFELS = Renderer("surfels", render_surfels, render_surfels_vjp, channels)
 """2D Gaussian Splatting: any population that has the six fields of :class:`Gaussians`."""

@@ -87,7 +87,7 @@ class Prepared(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """The values that :func:`render` keeps for :func:`render_vjp`."""
+    """The values that :func:`render_planes` keeps for :func:`render_planes_vjp`."""
 
     prepared: Prepared
     bins: TileBins
@@ -146,7 +146,9 @@ def check_buffer_size(buffer_size: int | None) -> int:
     return int(buffer_size)
 
 
-def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:
+def render_planes(
+    model: Model, view: View, request: Request, *, buffer_size: int | None = None
+) -> tuple[RenderOutput, Tape]:
     """Render a view; return the image and a tape.
 
     Statistics of blending and of removal are those of the pixels' own order; a median depth is where on the ray the
@@ -187,8 +189,8 @@ def _extras(p: Prepared, bins: TileBins, output: RenderOutput, request: Request)
     return extras
 
 
-def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`, by the chain rule.
+def render_planes_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render_planes`, by the chain rule.
 
     The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
     """
