@@ -159,10 +159,10 @@ def choose_renderer(call: Call, name: str, dtype: str | None = None, arrays: str
         return CallRenderer(f"{name} {own}", own, lambda scene: _ours(call, scene, {"backend": name}, own))
     if kind == "planted":
         steps = planted_steps(call, rest)
-        return CallRenderer(name, dtype or "float64", lambda scene: _with_error(call, scene, steps, dtype or "float64"))
+        return CallRenderer(name, dtype or "float64", lambda scene: _run_wrong(call, scene, steps, dtype or "float64"))
     if name == "gsplat-torch" and call.peer is not None:
         function, own = call.peer(), dtype or "float64"
-        return CallRenderer(f"{name} {own}", own, lambda scene: _by_torch(call, function, scene, own))
+        return CallRenderer(f"{name} {own}", own, lambda scene: _run_torch(call, function, scene, own))
     if Path(name).is_dir():
         return CallRenderer(name, dtype or "float32", lambda scene: _read(call, Path(name), scene))
     if ":" in name:
@@ -245,7 +245,7 @@ def _case(name: str, about: StageArray, scene: str, got: np.ndarray, known: np.n
     return Case(f"{about.stage}: {name}", ratio <= 1, {**figures, "error / limit": ratio}, note)
 
 
-def _with_error(call: Call, scene: CallScene, steps: Any, dtype: str) -> Arrays:
+def _run_wrong(call: Call, scene: CallScene, steps: Any, dtype: str) -> Arrays:
     with np.errstate(all="ignore"):
         return _ours(call, scene, {"backend": "reference", "steps": steps}, dtype)
 
@@ -268,7 +268,7 @@ def _function(call: Call, name: str, dtype: str, arrays: str | None) -> CallRend
     function, vjp = load_function(name)
     kind, function = arrays or kind_of(function), _unpacked(function)
     if kind == "torch":
-        return CallRenderer(f"{name} {dtype}", dtype, lambda scene: _by_torch(call, function, scene, dtype))
+        return CallRenderer(f"{name} {dtype}", dtype, lambda scene: _run_torch(call, function, scene, dtype))
     if kind != "numpy":
         raise InputError(
             f"{name} computes with {kind}; {call.subject} are compared with numpy and torch: give --arrays"
@@ -314,7 +314,7 @@ def _numpy(value: Any) -> Floats:
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
 
 
-def _by_torch(call: Call, function: Callable[..., Any], scene: CallScene, dtype: str) -> Arrays:
+def _run_torch(call: Call, function: Callable[..., Any], scene: CallScene, dtype: str) -> Arrays:
     try:
         return _differentiated(call, function, scene, dtype, call.leaves)
     except NotImplementedError:  # by gsplat 1.5.3 with_eval3d where the pose is differentiated

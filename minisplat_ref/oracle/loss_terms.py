@@ -112,7 +112,7 @@ def loss_stage(
     if step is None:
         return None
     value, cotangents = evaluate({}, step)
-    named = _by_name(cotangents)
+    named = _name_cotangents(cotangents)
     probes = {name: PROBE * rng.normal(size=array.shape) for name, array in everything.items()}
     inputs = {
         name: array
@@ -124,7 +124,7 @@ def loss_stage(
         return Point((np.asarray(evaluate(dict(zip(inputs, args, strict=True)), step)[0]),))
 
     def vjp(v_loss: Floats) -> tuple[Floats, ...]:
-        v = _by_name(evaluate({}, step)[1])
+        v = _name_cotangents(evaluate({}, step)[1])
         return tuple(float(v_loss) * v.get(name, np.zeros_like(array)) for name, array in inputs.items())
 
     return Stage(stage_name(term), inputs, ("loss",), function, vjp)
@@ -139,12 +139,12 @@ def _acting_step(term: LossTerm, evaluate: Callable[[int], tuple[float, Cotangen
     """Return the first iteration in which the term has a value or a derivative."""
     for step in range(term.start + 1, term.start + 1 + N_STEPS):
         value, cotangents = evaluate(step)
-        if value != 0 or any(np.any(v) for v in _by_name(cotangents).values()):
+        if value != 0 or any(np.any(v) for v in _name_cotangents(cotangents).values()):
             return step
     return None
 
 
-def _by_name(v: Cotangents) -> dict[str, Floats]:
+def _name_cotangents(v: Cotangents) -> dict[str, Floats]:
     alpha = {} if v.alpha is None else {ALPHA: v.alpha}
     return {**v.channels, **alpha, **v.gaussians, **v.shared}
 

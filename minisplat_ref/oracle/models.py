@@ -37,7 +37,7 @@ Stages = Callable[[Backend, Setting, np.random.Generator], Sequence[Stage]]
 
 
 class Drawn(NamedTuple):
-    """A model that has been rendered, of which a relative says on which sides of its kinks it is."""
+    """A rendered model, for which a relative returns the sides of its kinks."""
 
     model: Model
     view: View

@@ -69,7 +69,7 @@ def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> li
     cases = model_cases(backend, conventions, _own_representation(relative), relative.stages)
     for recipe in relative.recipes:
         if recipe.active_calibrations:
-            calibrated = _with_calibrations(relative.representation, recipe)
+            calibrated = _add_calibrations(relative.representation, recipe)
             cases += model_cases(backend, conventions, calibrated, None)
     core = [term for recipe in RECIPES.values() for term in recipe.losses]
     terms = own_terms([*relative.losses, *(term for recipe in relative.recipes for term in recipe.losses)], core)
@@ -84,7 +84,7 @@ def _own_representation(relative: Relative) -> Representation | None:
     return None if relative.representation == GAUSSIANS else relative.representation
 
 
-def _with_calibrations(representation: Representation, recipe: Recipe) -> Representation:
+def _add_calibrations(representation: Representation, recipe: Recipe) -> Representation:
     """Return the representation with a recipe's calibrations, whose parameters are among the shared ones."""
 
     def shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:

@@ -7,7 +7,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.format import Arrays, Golden
 
 
-def _as_they_are(conventions: Conventions) -> Conventions:
+def _keep(conventions: Conventions) -> Conventions:
     return conventions
 
 
@@ -22,7 +22,7 @@ class ComparedRenderer(NamedTuple):
     """Whether the truth is the input of every stage, so that a difference arises in its own stage."""
     arrays: Callable[[Golden], Arrays]
     """Returns all arrays that it can for a scene with known truth; shapes as in the golden format."""
-    rules: Callable[[Conventions], Conventions | None] = _as_they_are
+    rules: Callable[[Conventions], Conventions | None] = _keep
     """The conventions that it follows for a scene with these; None where it cannot render the scene at all."""
     ignores: tuple[str, ...] = ()
     """Cotangents that it cannot take; they are set to zero for the truth as well."""

@@ -105,7 +105,7 @@ def thresholds(
     found = Thresholds(np.zeros(shape), np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool))
     for tile in tile_hits(projection, bins, lenient):
         if len(tile.ids):
-            of_tile = _of_tile(tile, projection, conventions, margins, slack)
+            of_tile = _examine_tile(tile, projection, conventions, margins, slack)
             found.allowance[tile.ys, tile.xs] = span * of_tile.change
             found.jumps[tile.ys, tile.xs] = of_tile.jumps
             found.kinks[tile.ys, tile.xs] = of_tile.kinks
@@ -153,7 +153,7 @@ def lenient_conventions(conventions: Conventions, margins: Margins, slack: float
     return conventions._replace(alpha_min=alpha_min, transmittance_min=0.0)
 
 
-def _of_tile(
+def _examine_tile(
     tile: TileHits, projection: Projection, conventions: Conventions, margins: Margins, slack: float
 ) -> _OfTile:
     """Examine every hit of a tile; the rows of the arrays are its G hits, front to back, the columns its P pixels."""

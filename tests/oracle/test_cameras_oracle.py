@@ -10,8 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.mechanisms.cameras.gsplat_call import STEPS
 from minisplat_ref.mechanisms.cameras.oracle.call import CALL, STAGES
 from minisplat_ref.mechanisms.cameras.oracle.hard_cases import CASES, run_cases, select
-from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED
-from minisplat_ref.mechanisms.cameras.oracle.profiles import gsplat_1_5, has_all_points
+from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED, gsplat_1_5, has_all_points
 from minisplat_ref.oracle import call_comparison
 from minisplat_ref.oracle.call_comparison import choose_renderer, compare, truth
 from minisplat_ref.types import Camera, Primitives

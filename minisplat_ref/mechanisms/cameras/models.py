@@ -74,7 +74,7 @@ def _coefficients(camera: Camera) -> tuple[float, ...]:
     return camera.optics.coefficients
 
 
-def _of_lens(lens: LensFunctions, depths: Callable, depths_vjp: Callable) -> CameraModel:
+def _make_lens_model(lens: LensFunctions, depths: Callable, depths_vjp: Callable) -> CameraModel:
     """Return the camera whose image is that of a lens, times the focal lengths, about the principal point."""
 
     def project(x: Floats, camera: Camera) -> Floats:
@@ -144,8 +144,8 @@ ORTHOGRAPHIC = CameraModel(
 )
 """Focal lengths are pixels per world unit."""
 MODELS = {
-    "brown": _of_lens(BROWN, z_depths, z_depths_vjp),
-    "fisheye": _of_lens(FISHEYE, distances, distances_vjp),
+    "brown": _make_lens_model(BROWN, z_depths, z_depths_vjp),
+    "fisheye": _make_lens_model(FISHEYE, distances, distances_vjp),
     "orthographic": ORTHOGRAPHIC,
 }
 """By :attr:`Optics.model`; a camera without optics is ``PERSPECTIVE``."""

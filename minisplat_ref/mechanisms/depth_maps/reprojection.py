@@ -95,14 +95,14 @@ def sample_depth(depth: Floats, pixels: Floats) -> Floats:
 def round_trip(reference: DepthView, source: DepthView) -> RoundTrip:
     """Return each pixel of the reference after its way to a source and back."""
     shape = reference.depth.shape
-    in_source = _to_camera(unproject(reference).reshape(-1, 3), source.camera)  # [P, 3]
+    in_source = _transform_to_camera(unproject(reference).reshape(-1, 3), source.camera)  # [P, 3]
     is_before = (reference.depth.ravel() > 0) & (in_source[:, 2] > 0)
     in_source = np.where(is_before[:, None], in_source, [0, 0, 1])
     p_k = pinhole(in_source, source.camera)
     d_k = np.where(is_before, sample_depth(source.depth, p_k), 0)
     rays = pinhole_rays(p_k[:, 0], p_k[:, 1], source.camera)
     X_k = (d_k[:, None] * rays - source.camera.cam_from_world_t) @ source.camera.cam_from_world_R
-    back = _to_camera(X_k, reference.camera)
+    back = _transform_to_camera(X_k, reference.camera)
     is_seen = (d_k > 0) & (back[:, 2] > 0)
     back = np.where(is_seen[:, None], back, [0, 0, 1])
     rows, columns = np.indices(shape)
@@ -144,5 +144,5 @@ def nearest_views(cameras: Sequence[Camera], n_sources: int, max_degrees: float 
     return chosen
 
 
-def _to_camera(points: Floats, camera: Camera) -> Floats:
+def _transform_to_camera(points: Floats, camera: Camera) -> Floats:
     return points @ camera.cam_from_world_R.T + camera.cam_from_world_t

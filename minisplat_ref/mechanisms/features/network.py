@@ -117,8 +117,8 @@ def as_network(arrays: Mapping[str, NDArray[Any]], source: str) -> Convolutions:
     _expect(source, "std", std, (3,))
     if not std.all():
         raise InputError(f"{source}: std has a zero, by which colours would be divided; {WAY_OUT}")
-    taps = _convolutions_of(source, "taps", arrays, 1, len(weights))
-    pool_before = _convolutions_of(source, "pool_before", arrays, 2, len(weights))
+    taps = _parse_numbers(source, "taps", arrays, 1, len(weights))
+    pool_before = _parse_numbers(source, "pool_before", arrays, 2, len(weights))
     if not taps:
         raise InputError(f"{source}: taps names no convolution, so there are no features; {WAY_OUT}")
     return Convolutions(tuple(weights), tuple(biases), pool_before, taps, mean, std)
@@ -133,7 +133,7 @@ def _expect(source: str, name: str, array: NDArray[Any] | None, shape: tuple[int
     check_finite(f"{source}: {name}", array)
 
 
-def _convolutions_of(source: str, name: str, arrays: Mapping[str, NDArray[Any]], first: int, n: int) -> frozenset[int]:
+def _parse_numbers(source: str, name: str, arrays: Mapping[str, NDArray[Any]], first: int, n: int) -> frozenset[int]:
     """Return the numbers of convolutions that an array names."""
     array = arrays.get(name)
     if array is None:

@@ -48,14 +48,14 @@ def _fuse_slabs(volume: Volume, grid: Grid, camera: Camera, view: DepthMap, trun
     pixels = pinhole(in_camera[is_before], camera)
     shown, colors = _sample(view, pixels, t[is_before])
     s = shown - depths[is_before]
-    says = (shown > 0) & (s >= -t[is_before])
-    at = tuple(index[says] for index in np.nonzero(is_before))
-    s, t_said, colors = s[says], t[is_before][says], colors[says]
+    is_valid = (shown > 0) & (s >= -t[is_before])
+    at = tuple(index[is_valid] for index in np.nonzero(is_before))
+    s, t_valid, colors = s[is_valid], t[is_before][is_valid], colors[is_valid]
     distances, weights, means, n_near = (field[slabs] for field in volume)
     w = weights[at]
-    distances[at] = (w * distances[at] + np.minimum(s / t_said, 1)) / (w + 1)
+    distances[at] = (w * distances[at] + np.minimum(s / t_valid, 1)) / (w + 1)
     weights[at] = w + 1
-    is_near = s < t_said
+    is_near = s < t_valid
     near = tuple(index[is_near] for index in at)
     n_near[near] += 1
     means[near] += (colors[is_near] - means[near]) / n_near[near][:, None]

@@ -125,7 +125,7 @@ def prefilter_vjp(image: Floats, v: Filtered) -> Floats:
     return v.maps[0] + np.repeat(np.repeat(shared, finer, axis=0), finer, axis=1)
 
 
-def _between(roughness: Floats) -> tuple[Ints, Floats]:
+def _find_knots(roughness: Floats) -> tuple[Ints, Floats]:
     """Return the index [P] of the knot below, and the share [P] of the knot above."""
     below = np.clip(np.searchsorted(KNOTS, roughness, side="right") - 1, 0, len(KNOTS) - 2)
     low, step = np.array(KNOTS)[below], STEPS[below]
@@ -134,7 +134,7 @@ def _between(roughness: Floats) -> tuple[Ints, Floats]:
 
 def reflected(light: Filtered, directions: Floats, roughness: Floats) -> Floats:
     """Return the light [P, 3] that surfaces of a roughness [P] in [0, 1] see around unit directions [P, 3]."""
-    below, share = _between(roughness)
+    below, share = _find_knots(roughness)
     colors = np.zeros_like(directions)
     for k, image in enumerate(light.maps):
         weights = np.where(below == k, 1 - share, np.where(below == k - 1, share, 0)).astype(directions.dtype)
@@ -152,7 +152,7 @@ def reflected_vjp(
 
         c = (1 - f) c_k + f c_k+1,   v_f = v_c . (c_k+1 - c_k),   v_roughness = v_f / (knot_k+1 - knot_k)
     """
-    below, share = _between(roughness)
+    below, share = _find_knots(roughness)
     v_directions, v_share, v_maps = np.zeros_like(directions), np.zeros(len(directions)), []
     for k, image in enumerate(light.maps):
         is_upper = below == k - 1

@@ -262,7 +262,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         v_normals = v.surface.normals @ R.T
         v_x = towards_vjp(tape.sight.x, tape.sight.d, -v.surface.to_camera @ R.T)
         v_R = tape.sight.normals.T @ v.surface.normals - tape.sight.d.T @ v.surface.to_camera
-    return _of_parameters(tape, v_blend.surfels, (v_x, v_normals, v_R), (v_coefficients, v_carried))._replace(
+    return _parameters_vjp(tape, v_blend.surfels, (v_x, v_normals, v_R), (v_coefficients, v_carried))._replace(
         background=v_background.astype(dtype),
         shared={
             ENVIRONMENT: (tape.environment * prefilter_vjp(tape.environment, v.light)).astype(dtype),
@@ -271,7 +271,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
     )
 
 
-def _of_parameters(
+def _parameters_vjp(
     tape: ReflectiveTape, v: SurfelGradient, of_sight: tuple[Floats, Floats, Floats], of_fields: tuple[Floats, Floats]
 ) -> RenderGradient:
     """Return the gradient with respect to population and pose, without those of background and shared parameters."""

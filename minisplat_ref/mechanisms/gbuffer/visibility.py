@@ -45,7 +45,7 @@ def transmittances(primitives: Primitives, rays: Rays, conventions: Conventions,
     """
     records = _records(primitives)
     if not backend.is_compiled:
-        return _by_all_pairs(records, rays, conventions)
+        return _try_all_pairs(records, rays, conventions)
     tree = tree_of(records, conventions)
     left = np.empty(len(rays.near))
     wide = Rays(*(np.ascontiguousarray(field, np.float64) for field in rays))
@@ -62,7 +62,7 @@ def _records(primitives: Primitives) -> Floats:
     return np.column_stack([opacities, means, axes[:, :, 0], axes[:, :, 1], R[:, :, 2]])
 
 
-def _by_all_pairs(records: Floats, rays: Rays, conventions: Conventions) -> Floats:
+def _try_all_pairs(records: Floats, rays: Rays, conventions: Conventions) -> Floats:
     left = np.ones(len(rays.near))
     opacities, centres, normals = records[:, OPACITY], records[:, CENTRE:U], records[:, NORMAL:]
     for first in range(0, len(left), RAYS_AT_ONCE):

@@ -75,7 +75,7 @@ def field(phi: Floats, coefficients: Floats, tau: Floats) -> Floats:
     -------
     ndarray of shape (N, D)
     """
-    values: Floats = phi @ _at(coefficients, tau)
+    values: Floats = phi @ _evaluate(coefficients, tau)
     return values
 
 
@@ -111,7 +111,7 @@ def field_vjp(
     v : ndarray of shape (N, D)
         Derivative with respect to the values.
     """
-    s = phi * (v @ _at(coefficients, tau).T)  # [N, B]
+    s = phi * (v @ _evaluate(coefficients, tau).T)  # [N, B]
     scale = places.dtype.type(1 / width**2)
     squared = _squared_distances(places, centers)
     return FieldGradient(
@@ -127,11 +127,11 @@ def field_jacobians(
 ) -> Floats:
     """Return ``df_n / dx_n = sum_b A_b (phi_nb (c_b - x_n) / h^2)^T``, [N, D, 3]; arguments as for the gradient."""
     slopes = phi[..., None] * (centers - places[:, None, :]) / width**2  # [N, B, 3]
-    jacobians: Floats = np.einsum("bd,nbj->ndj", _at(coefficients, tau), slopes)
+    jacobians: Floats = np.einsum("bd,nbj->ndj", _evaluate(coefficients, tau), slopes)
     return jacobians
 
 
-def _at(coefficients: Floats, tau: Floats) -> Floats:
+def _evaluate(coefficients: Floats, tau: Floats) -> Floats:
     """Return the polynomials' values A, [B, D] in the dtype of the coefficients."""
     return np.tensordot(tau.astype(coefficients.dtype), coefficients, axes=(0, 1))
 

@@ -88,7 +88,7 @@ def encode_vjp(table: Floats, x: Floats, levels: Levels, v_features: Floats) -> 
         Derivative with respect to the encoding.
     """
     v_table, v_x = np.zeros_like(table), np.zeros_like(x)
-    for level, (n_cells, v) in enumerate(zip(levels.resolutions, _by_level(v_features, levels), strict=True)):
+    for level, (n_cells, v) in enumerate(zip(levels.resolutions, _split_levels(v_features, levels), strict=True)):
         corners, weights, signs, is_inside = _interpolation(x, n_cells, levels.n_rows)
         np.add.at(v_table[level], corners, weights.prod(axis=2)[..., None] * v[:, None, :])
         along = np.sum(v[:, None, :] * table[level][corners], axis=2)  # [B, 8]
@@ -121,5 +121,5 @@ def _interpolation(x: Floats, n_cells: int, n_rows: int) -> tuple[Ints, Floats, 
     return rows, weights, 2 * CORNERS - 1, (x >= 0) & (x <= 1)
 
 
-def _by_level(v_features: Floats, levels: Levels) -> list[Floats]:
+def _split_levels(v_features: Floats, levels: Levels) -> list[Floats]:
     return np.split(v_features, len(levels.resolutions), axis=1)

@@ -22,7 +22,7 @@ def as_surfels(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
     return gaussians._replace(quats=quats, log_scales=log_scales)
 
 
-def _with_opacity_min(event: Event) -> Event:
+def _set_opacity_min(event: Event) -> Event:
     """Return an event of 3DGS, with the released bound of opacity if it prunes faint Gaussians."""
     if isinstance(event, Every) and does(event, prune_faint):
         return event._replace(action=partial(prune_faint, min_opacity=OPACITY_MIN))
@@ -30,5 +30,5 @@ def _with_opacity_min(event: Event) -> Event:
 
 
 DISCS = Representation("surfels", extend=as_surfels, renderer=SURFELS)
-DISC_EVENTS = tuple(_with_opacity_min(event) for event in GS_ACCEL.events)
+DISC_EVENTS = tuple(_set_opacity_min(event) for event in GS_ACCEL.events)
 """The density control of 3DGS, which removes surfels of an opacity below 0.05."""

@@ -56,7 +56,7 @@ def measure_rays(surfels: Surfels, bins: TileBins, conventions: Conventions) -> 
         pixels, w, z = (tile.ys, tile.xs), _weights(tile), tile.hit.depths
         if len(z) == 0:
             continue
-        A, M = _before(w), _before(w * z)
+        A, M = _sum_earlier_rows(w), _sum_earlier_rows(w * z)
         is_median = _is_median(tile)
         values = (is_median * z).sum(axis=0), 2 * np.sum(w * (z * A - M), axis=0), (w * z).sum(axis=0), w.sum(axis=0)
         for image, value in zip(images, values, strict=True):
@@ -102,11 +102,11 @@ def measure_rays_vjp(
         if len(tile.ids) == 0:
             continue
         w, z, alphas = _weights(tile), tile.hit.depths, tile.alphas
-        A, M, v = _before(w), _before(w * z), v_distortion[tile.ys, tile.xs]
+        A, M, v = _sum_earlier_rows(w), _sum_earlier_rows(w * z), v_distortion[tile.ys, tile.xs]
         A_end, M_end = w.sum(axis=0), (w * z).sum(axis=0)
         v_w = 2 * v * ((z * A - M) + (M_end - M - w * z) - z * (A_end - A - w))
         v_z = 2 * v * w * (2 * A + w - A_end) + _is_median(tile) * v_median[tile.ys, tile.xs]
-        behind = np.sum(w * v_w, axis=0) - _before(w * v_w) - w * v_w
+        behind = np.sum(w * v_w, axis=0) - _sum_earlier_rows(w * v_w) - w * v_w
         v_alphas = np.where(alphas > 0, tile.transmittances[:-1] * v_w - behind / (1 - alphas), 0)
         v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v_alphas)
         v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v_alphas)
@@ -120,7 +120,7 @@ def _weights(tile: TileHits) -> Floats:
     return tile.alphas * tile.transmittances[:-1]
 
 
-def _before(values: Floats) -> Floats:
+def _sum_earlier_rows(values: Floats) -> Floats:
     """Return for each row the sum of the rows before it."""
     return np.cumsum(values, axis=0) - values
 

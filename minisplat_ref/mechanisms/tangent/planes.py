@@ -110,7 +110,7 @@ def project(primitives: Primitives, camera: Camera, conventions: Conventions) ->
         raise InputError("tangent planes have no compensated opacities: leave the antialiased profile out")
     camera = with_principal_point(camera, conventions)
     means, quats, scales, opacities = (field.astype(np.float64) for field in primitives)
-    x, r, n, C = _in_camera(means, quats, scales, camera)
+    x, r, n, C = _change_frame(means, quats, scales, camera)
     B = tangent_bases(n)  # [N, 2, 3]
     S = B @ C @ np.swapaxes(B, 1, 2) / (r * r)[:, None, None] + _low_pass(camera, conventions) * np.eye(2)
     det = determinants(S)
@@ -178,7 +178,7 @@ def project_vjp(
     camera = with_principal_point(camera, conventions)
     means, quats, scales, _ = (field[rows].astype(np.float64) for field in primitives)
     v_n, v_K, v_o, v_z = (field[rows] for field in v_footprints)
-    _, r, n, C = _in_camera(means, quats, scales, camera)
+    _, r, n, C = _change_frame(means, quats, scales, camera)
     K = footprints.conics[rows]
 
     v_G = -K @ v_K @ K
@@ -191,7 +191,7 @@ def project_vjp(
     R, _ = pose(camera, np.dtype(np.float64))
     v_quats, v_scales = covariances_vjp(quats, scales, R.T @ v_C @ R)
     v_R = 2 * (v_C @ R @ covariances(quats, scales)).sum(axis=0) + v_x.T @ means
-    v_means2d = _in_pixels(v_footprints.normals[rows], n, camera)
+    v_means2d = _compute_pixel_gradient(v_footprints.normals[rows], n, camera)
     parts = v_x @ R, v_quats, v_scales, v_o, v_means2d
     v_means, v_quats, v_scales, v_o, v_means2d = (_scatter(v, rows, len(footprints.radii), dtype) for v in parts)
     v_t = v_x.sum(axis=0).astype(dtype)
@@ -257,7 +257,9 @@ def tangent_bases(normals: Floats) -> Floats:
     return np.stack([first, np.cross(normals, first)], axis=1)
 
 
-def _in_camera(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> tuple[Floats, Floats, Floats, Floats]:
+def _change_frame(
+    means: Floats, quats: Floats, scales: Floats, camera: Camera
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Return x [N, 3], r [N], n [N, 3] and C [N, 3, 3]."""
     R, t = pose(camera, means.dtype)
     x = means @ R.T + t
@@ -299,7 +301,7 @@ def _boxes(n: Floats, G: Floats, opacities: Floats, camera: Camera, conventions:
     return np.where(is_seen[:, None], np.hstack([low, high]), 0)
 
 
-def _in_pixels(v_normals: Floats, normals: Floats, camera: Camera) -> Floats:
+def _compute_pixel_gradient(v_normals: Floats, normals: Floats, camera: Camera) -> Floats:
     """Return the derivative with respect to the pixel at which a direction is seen: ``dn = (n_z / f) P e_k dp_k``."""
     focal = np.array([camera.fx, camera.fy])
     along = v_normals - normals * np.sum(normals * v_normals, axis=1, keepdims=True)

@@ -123,7 +123,7 @@ def compare_bounds(given: Arrays, truth: Golden) -> Bounds | None:
     if is_extra.any() and all(key in given for key in FOOTPRINT):
         rows = {key: _merge_rows(is_extra, given[key], expected[key]) for key in FOOTPRINT}
         projection = projection_of(expected | rows)
-    boxes = bounds["boxes"] if "boxes" in bounds else _boxes_of(projection, bounds["radii"], truth)
+    boxes = bounds["boxes"] if "boxes" in bounds else _make_boxes(projection, bounds["radii"], truth)
     projection = projection._replace(boxes=np.where(shows[:, None], boxes, 0).astype(np.int32))
     bins = REFERENCE.bin_gaussians(projection, grid_of(expected, (16, 16)), truth.conventions)
     changes = _changes_image(projection, bins, truth)
@@ -180,7 +180,7 @@ def _changes_image(projection: Projection, bins: TileBins, truth: Golden) -> boo
     return any(difference(a, b, COMPARE_FLOAT64, may_flip).n_over for a, b in pairs)
 
 
-def _boxes_of(projection: Projection, radii: Ints, truth: Golden) -> Ints:
+def _make_boxes(projection: Projection, radii: Ints, truth: Golden) -> Ints:
     """Return boxes of half-sides ``radii`` around the means, clipped to the image."""
     size = truth.arrays["image_size"]
     low = np.clip(np.floor(projection.means2d - radii), 0, size)

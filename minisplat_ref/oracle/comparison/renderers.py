@@ -118,7 +118,7 @@ def _check_kind(file: Path, name: str, array: NDArray[Any]) -> None:
 NOT_OF_GSPLAT = ("loss", "statistics", "surface", "adam")  # stages that gsplat's functions in torch do not have
 
 
-def _on_gpu(name: str, dtype: str) -> ComparedRenderer:
+def _choose_gpu(name: str, dtype: str) -> ComparedRenderer:
     """Return one of our backends for a GPU; where the simulator replaces the GPU, the name mentions it."""
     backend = get_backend(name)
     where = " in the simulator" if backend.residence.is_simulated else ""
@@ -173,7 +173,7 @@ def choose_renderer(name: str, dtype: str | None) -> ComparedRenderer:
     if name in BACKENDS:
         return from_backend(BACKENDS[name], own_dtype)
     if name in (CUDA, CUDA_ATOMIC):
-        return _on_gpu(name, dtype or "float32")
+        return _choose_gpu(name, dtype or "float32")
     if kind == "planted" and not Path(name).is_dir():
         return with_planted_error(rest, own_dtype)
     if kind == "profile" and not Path(name).is_dir():
@@ -276,13 +276,13 @@ def choose_scenes(
         if rules is None or rounds or (golden.is_exact and profile is not None):
             left_out.append(scene)
         else:
-            chosen[scene] = _with_truth(golden, rules, renderer.ignores)
+            chosen[scene] = _complete(golden, rules, renderer.ignores)
     if not chosen:
         raise InputError(f"{renderer.name} can render none of the scenes {', '.join(wanted)}: other conventions")
     return chosen, tuple(left_out)
 
 
-def _with_truth(golden: Golden, rules: Conventions, ignores: tuple[str, ...]) -> Golden:
+def _complete(golden: Golden, rules: Conventions, ignores: tuple[str, ...]) -> Golden:
     """Return all arrays under these conventions, or a folder's own if it follows them; ignored ones are zero."""
     is_complete = "v_means" in golden.arrays and not any(golden.arrays[name].any() for name in ignores)
     if is_complete and rules == golden.conventions:

@@ -274,7 +274,7 @@ def as_report(renderer: ComparedRenderer, rows: list[Row], settings: Mapping[str
     scenes = list(dict.fromkeys(row.scene for row in rows))
     first = first_divergence(rows)
     given = [stage for stage in STAGES if any(r.stage == stage and r.status != "not given" for r in rows)]
-    unknown = "" if first is None else _or_before(renderer, first, given)
+    unknown = "" if first is None else _describe_unknown(renderer, first, given)
     verdict = (
         f"all {len(given)} stages that it gives agree"
         if first is None
@@ -327,7 +327,7 @@ def slight(rows: Iterable[Row]) -> list[str]:
     ]
 
 
-def _or_before(renderer: ComparedRenderer, first: Row, given: Iterable[str]) -> str:
+def _describe_unknown(renderer: ComparedRenderer, first: Row, given: Iterable[str]) -> str:
     """Say which stages that the first one is computed from are not given, so that the error may be in one of them."""
     if renderer.is_staged:
         return ""

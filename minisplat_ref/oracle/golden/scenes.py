@@ -36,7 +36,7 @@ class Recipe(NamedTuple):
     is_exact: bool = False
 
 
-def _with_round_thresholds(conventions: Conventions, name: str) -> Conventions:
+def _round_thresholds(conventions: Conventions, name: str) -> Conventions:
     """Return conventions whose thresholds are exact in binary and equal to reachable opacities and products."""
     return conventions._replace(
         name=name, near_plane=2.0**-2, far_plane=8.0, alpha_min=2.0**-8, alpha_max=0.75, transmittance_min=2.0**-3
@@ -92,7 +92,7 @@ RECIPES = (
     Recipe(
         "equality",
         "transmittance, clamp, planes and depths that equal their thresholds or each other",
-        _with_round_thresholds(GSPLAT_MAIN, "EQUALITY"),
+        _round_thresholds(GSPLAT_MAIN, "EQUALITY"),
         (24, 16),
         sh_degree=1,
         is_exact=True,
@@ -100,7 +100,7 @@ RECIPES = (
     Recipe(
         "equality-inria",
         "the same by the rules of the 3DGS rasteriser, and an alpha that equals the least",
-        _with_round_thresholds(INRIA, "EQUALITY_INRIA"),
+        _round_thresholds(INRIA, "EQUALITY_INRIA"),
         (24, 16),
         sh_degree=1,
         is_exact=True,
@@ -129,7 +129,7 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     """
     rng = np.random.default_rng((seed, *recipe.name.encode()))
     size, center = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point)
-    placed = _at_thresholds(recipe, rng) if recipe.is_exact else _scatter(recipe, rng)
+    placed = _stack_at_thresholds(recipe, rng) if recipe.is_exact else _scatter(recipe, rng)
     n = len(placed["means"])
     n_rest = (recipe.sh_degree + 1) ** 2 - 1
     image_shape = (size[1], size[0])
@@ -178,7 +178,7 @@ def _scatter(recipe: Recipe, rng: np.random.Generator) -> Arrays:
     }
 
 
-def _at_thresholds(recipe: Recipe, rng: np.random.Generator) -> Arrays:
+def _stack_at_thresholds(recipe: Recipe, rng: np.random.Generator) -> Arrays:
     """Stack Gaussians on the centres of five pixels, where their alphas are their opacities, multiples of 1/256.
 
     The camera looks along z from a position in multiples of 1/8; all depths that matter are powers of two, so that the

@@ -12,7 +12,7 @@ ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
 NAN, INF = float("nan"), float("inf")
 
 
-def _parameters_with(field: str, value: float) -> HardCase:
+def _spoil_parameters(field: str, value: float) -> HardCase:
     def build() -> Parameters:
         population = cloud(sh_degree=1)
         array = getattr(population, field).copy()
@@ -28,7 +28,7 @@ def _parameters_with(field: str, value: float) -> HardCase:
     )
 
 
-def _array_with(name: str, value: float) -> HardCase:
+def _spoil_array(name: str, value: float) -> HardCase:
     def build() -> Call:
         subject = call([[0, 0, 3.0], [0.1, 0, 4]])
         array = subject.arrays[name].copy()
@@ -44,7 +44,7 @@ def _array_with(name: str, value: float) -> HardCase:
     )
 
 
-def _call_with(name: str, why: str, refusal: str, **changes: Any) -> HardCase:
+def _spoil_call(name: str, why: str, refusal: str, **changes: Any) -> HardCase:
     """A call of two Gaussians in which something is wrong."""
 
     def build() -> Call:
@@ -82,8 +82,8 @@ def _intrinsic(row: int, column: int, value: float) -> np.ndarray:
 
 
 BAD_INPUT = (
-    *(_parameters_with(field, NAN) for field in Gaussians._fields),
-    *(_parameters_with(field, INF) for field in ("means", "log_scales", "opacity_logits", "sh_rest")),
+    *(_spoil_parameters(field, NAN) for field in Gaussians._fields),
+    *(_spoil_parameters(field, INF) for field in ("means", "log_scales", "opacity_logits", "sh_rest")),
     HardCase(
         "zero-quaternion",
         "no rotation: 0 / 0",
@@ -91,48 +91,48 @@ BAD_INPUT = (
         _zero_quaternion,
         refusal="row 7 is a zero quaternion",
     ),
-    *(_array_with(name, NAN) for name in ARRAYS),
-    *(_array_with(name, -INF) for name in ("means", "colors")),
-    _call_with(
+    *(_spoil_array(name, NAN) for name in ARRAYS),
+    *(_spoil_array(name, -INF) for name in ("means", "colors")),
+    _spoil_call(
         "call-nan-background", "it shines through every pixel", "backgrounds is nan", backgrounds=np.full((1, 3), NAN)
     ),
-    _call_with(
+    _spoil_call(
         "call-zero-quaternion",
         "no rotation: 0 / 0",
         "row 1 is a zero quaternion",
         quats=np.array([[1.0, 0, 0, 0], [0] * 4]),
     ),
-    _call_with(
+    _spoil_call(
         "call-negative-scale",
         "a logarithm that was not exponentiated",
         "give exp(log_scales)",
         scales=np.full((2, 3), -2.0),
     ),
-    _call_with(
+    _spoil_call(
         "call-opacity-above-1",
         "a logit that was not activated",
         "give sigmoid(opacity_logits)",
         opacities=np.array([0.5, 1.5]),
     ),
-    _call_with("call-opacity-below-0", "the same", "give sigmoid(opacity_logits)", opacities=np.array([0.5, -0.1])),
-    _call_with(
+    _spoil_call("call-opacity-below-0", "the same", "give sigmoid(opacity_logits)", opacities=np.array([0.5, -0.1])),
+    _spoil_call(
         "call-transposed-view",
         "t is in the last row",
         "transposed if yours has t in its last row",
         viewmats=_view(3, 0, 1.0),
     ),
-    _call_with(
+    _spoil_call(
         "call-singular-view",
         "it flattens the world: there is no camera's centre",
         "singular 3 x 3 part",
         viewmats=_view(2, 2, 0.0),
     ),
-    _call_with("call-focal-length-0", "division by 0", "they must be positive pixels", Ks=_intrinsic(0, 0, 0.0)),
-    _call_with(
+    _spoil_call("call-focal-length-0", "division by 0", "they must be positive pixels", Ks=_intrinsic(0, 0, 0.0)),
+    _spoil_call(
         "call-focal-length-negative", "mirrors the image", "they must be positive pixels", Ks=_intrinsic(1, 1, -30.0)
     ),
-    _call_with("call-skew", "not a pinhole of this renderer", "rectify the image", Ks=_intrinsic(0, 1, 0.1)),
-    _call_with(
+    _spoil_call("call-skew", "not a pinhole of this renderer", "rectify the image", Ks=_intrinsic(0, 1, 0.1)),
+    _spoil_call(
         "call-no-camera",
         "an empty batch",
         "give at least one",
@@ -140,32 +140,32 @@ BAD_INPUT = (
         Ks=np.zeros((0, 3, 3)),
         backgrounds=None,
     ),
-    _call_with("call-no-width", "an image without pixels", "width is 0", size=(0, 9)),
-    _call_with(
+    _spoil_call("call-no-width", "an image without pixels", "width is 0", size=(0, 9)),
+    _spoil_call(
         "call-near-behind-far", "nothing is between them", "must be 0 <= near < far", near_plane=2.0, far_plane=1.0
     ),
-    _call_with("call-nan-near-plane", "no comparison with it is true", "must be 0 <= near < far", near_plane=NAN),
-    _call_with("call-negative-low-pass", "a covariance that is not one", "eps2d is -1", eps2d=-1.0),
-    _call_with(
+    _spoil_call("call-nan-near-plane", "no comparison with it is true", "must be 0 <= near < far", near_plane=NAN),
+    _spoil_call("call-negative-low-pass", "a covariance that is not one", "eps2d is -1", eps2d=-1.0),
+    _spoil_call(
         "call-integers",
         "whole numbers would round everything",
         "cast all arrays",
         means=np.array([[0, 0, 3], [0, 0, 4]]),
     ),
-    _call_with("call-wrong-shape", "one scale for each", "scales has shape [2]", scales=np.full(2, 0.1)),
-    _call_with(
+    _spoil_call("call-wrong-shape", "one scale for each", "scales has shape [2]", scales=np.full(2, 0.1)),
+    _spoil_call(
         "call-sh-degree-4",
         "there are constants up to degree 3",
         "must be 0 to 3",
         colors=np.zeros((2, 25, 3)),
         sh_degree=4,
     ),
-    _call_with(
+    _spoil_call(
         "call-sh-too-few",
         "degree 2 needs nine coefficients",
         "needs 9 coefficients",
         colors=np.zeros((2, 4, 3)),
         sh_degree=2,
     ),
-    _call_with("call-unknown-profile", "conventions are not guessed", "profile 'gsplat' is unknown", profile="gsplat"),
+    _spoil_call("call-unknown-profile", "conventions are not guessed", "profile 'gsplat' is unknown", profile="gsplat"),
 )

@@ -86,7 +86,7 @@ IMAGES = (
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
 
-def _along(axis: int, sign: float) -> Parameters:
+def _look_straight(axis: int, sign: float) -> Parameters:
     """One Gaussian straight ahead of a camera that looks along a world axis: the other two components are 0."""
     rows = [np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3], np.eye(3)[axis]]
     R = np.array(rows) * [[1.0], [sign], [sign]]  # a rotation for either sign
@@ -115,7 +115,7 @@ COLORS = (
             f"sh-3-at-{'plus' if sign > 0 else 'minus'}-{name}",
             "two components of the direction are 0: most polynomials vanish, their derivatives do not",
             "the polynomials' value and derivative; no 0 / 0 of angles",
-            lambda axis=axis, sign=sign: _along(axis, sign),  # type: ignore[misc]
+            lambda axis=axis, sign=sign: _look_straight(axis, sign),  # type: ignore[misc]
         )
         for axis, name in enumerate(AXES)
         for sign in (1.0, -1.0)

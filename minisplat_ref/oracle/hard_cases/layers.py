@@ -101,7 +101,7 @@ LAYERS = (
         "below and at it culled: the extent is nothing; above it one pixel, which a centre on the mean's place may hit",
         lambda: call(
             [[0.013, 0.007, 3], [0.11, 0.17, 3], [0, 0, 3.0], [0.3, 0.2, 4]],
-            opacities=[float(opacity) for opacity in (*_around(np.float32(1 / 256)), 0.5)],
+            opacities=[float(opacity) for opacity in (*_list_neighbours(np.float32(1 / 256)), 0.5)],
             profile=AT_1_OF_256,
         ),
     ),
@@ -111,7 +111,7 @@ LAYERS = (
         "below it culled; at it and above drawn, as far as alpha reaches",
         lambda: call(
             [[0.013, 0.007, 3], [0.11, 0.17, 3], [0, 0, 3.0], [0.3, 0.2, 4]],
-            opacities=[float(opacity) for opacity in (*_around(np.float32(1 / 256)), 0.5)],
+            opacities=[float(opacity) for opacity in (*_list_neighbours(np.float32(1 / 256)), 0.5)],
             profile=AT_1_OF_256._replace(has_full_support=False),
         ),
     ),
@@ -265,7 +265,7 @@ LAYERS = (
 )
 
 
-def _around(number: np.float32) -> tuple[np.float32, np.float32, np.float32]:
+def _list_neighbours(number: np.float32) -> tuple[np.float32, np.float32, np.float32]:
     """Return a number between its neighbours."""
     return np.nextafter(number, np.float32(0)), number, np.nextafter(number, np.float32(1))
 

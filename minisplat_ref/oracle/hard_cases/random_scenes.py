@@ -103,7 +103,7 @@ def _draw_shapes(long: float, short: float, n_long: int) -> Callable[[Draw], Sub
     return make
 
 
-def _at_depths(low: float, high: float, **options: object) -> Callable[[Draw], Subject]:
+def _spread_depths(low: float, high: float, **options: object) -> Callable[[Draw], Subject]:
     """Depths from one number to another, logarithms uniform; footprints of some pixels."""
 
     def make(d: Draw) -> Subject:
@@ -114,18 +114,18 @@ def _at_depths(low: float, high: float, **options: object) -> Callable[[Draw], S
     return make
 
 
-def _around_the_camera(d: Draw) -> Subject:
+def _surround_camera(d: Draw) -> Subject:
     return Parameters(
         d.gaussians(means=d.rng.normal(size=(d.n, 3)), log_scales=np.log(d.log_uniform(0.1, 3, d.n, 3))), d.view()
     )
 
 
-def _at_the_near_plane(d: Draw) -> Subject:
+def _touch_near_plane(d: Draw) -> Subject:
     z = 0.5 + np.spacing(np.float32(0.5)) * d.rng.integers(-2, 3, d.n)
     return d.call(means=d.means(z), scales=d.log_uniform(1e-3, 0.05, d.n, 3), options={"near_plane": 0.5})
 
 
-def _opacities_of(values: list[float], n_ulps: int = 2, **options: object) -> Callable[[Draw], Subject]:
+def _pick_opacities(values: list[float], n_ulps: int = 2, **options: object) -> Callable[[Draw], Subject]:
     """Opacities at the given numbers, and a few units in the last place away."""
 
     def make(d: Draw) -> Subject:
@@ -137,7 +137,7 @@ def _opacities_of(values: list[float], n_ulps: int = 2, **options: object) -> Ca
     return make
 
 
-def _of_bytes(d: Draw) -> Subject:
+def _pick_bytes(d: Draw) -> Subject:
     """Any byte, half of them at most 3."""
     return d.call(opacities=d.rng.integers(0, 256, d.n) // d.rng.choice([1, 64], d.n) / 255)
 
@@ -240,7 +240,7 @@ def _channels(n_channels: int) -> Callable[[Draw], Subject]:
     return lambda d: d.call(n_channels)
 
 
-def _on_tile_edges(d: Draw) -> Subject:
+def _hit_tile_edges(d: Draw) -> Subject:
     """Centres on the corners of tiles of 16 and 32 pixels, of pixels, and on pixel centres."""
     view = d.view(fx=128.0, fy=128.0, cx=float(d.width // 2), cy=float(d.height // 2))
     pixels = np.column_stack([d.rng.choice([0, 15.5, 16, 16.5, 32, d.width], d.n), d.rng.choice([0, 8, 16, 32], d.n)])
@@ -249,7 +249,7 @@ def _on_tile_edges(d: Draw) -> Subject:
     return Parameters(d.gaussians(means=means, log_scales=np.log(d.log_uniform(0.005, 0.1, d.n, 3))), view)
 
 
-def _beside(d: Draw) -> Subject:
+def _place_aside(d: Draw) -> Subject:
     """Up to a thousand widths beside the view, and as large as far away: each covers the image still."""
     far = d.log_uniform(1, 1e3, d.n)
     angle = d.rng.uniform(0, 2 * np.pi, d.n)
@@ -258,7 +258,7 @@ def _beside(d: Draw) -> Subject:
     return Parameters(d.gaussians(means=means, log_scales=log_scales), d.view())
 
 
-def _by(conventions: object) -> Callable[[Draw], Subject]:
+def _follow(conventions: object) -> Callable[[Draw], Subject]:
     """Shapes of all sizes by the rules of another rasteriser."""
     return _draw_scales(1e-3, 3, conventions=conventions)
 
@@ -293,21 +293,21 @@ KINDS = (
     Kind("of-all-scales", "axis ratios up to 1e8 in one Gaussian", SHARP, _draw_scales(1e-6, 1e2), LONG),
     Kind("log-scales-plus-minus-40", "scales from 1e-18 to 1e17", SHARP, _log_scales_40, BEHIND),
     Kind(
-        "near-plane", "on the near plane and one or two roundings beside it", "only what is beyond", _at_the_near_plane
+        "near-plane", "on the near plane and one or two roundings beside it", "only what is beyond", _touch_near_plane
     ),
-    Kind("of-all-depths", "depths from the near plane to the far one", SHARP, _at_depths(0.011, 1e9)),
+    Kind("of-all-depths", "depths from the near plane to the far one", SHARP, _spread_depths(0.011, 1e9)),
+    Kind("around-the-camera", "behind, beside and over the camera", "only what is before it", _surround_camera, BEHIND),
     Kind(
-        "around-the-camera", "behind, beside and over the camera", "only what is before it", _around_the_camera, BEHIND
+        "far-beside", "up to a thousand widths away, covering the image", "gentle slopes of alpha", _place_aside, LONG
     ),
-    Kind("far-beside", "up to a thousand widths away, covering the image", "gentle slopes of alpha", _beside, LONG),
     Kind(
         "opacities-at-thresholds",
         "0, alpha_min, the clamp and 1, and a few roundings beside them",
         "each on its side; flips at the peaks only",
-        _opacities_of([0, ALPHA_MIN, 0.99, 1], profile=GSPLAT_MAIN._replace(alpha_min=ALPHA_MIN)),
+        _pick_opacities([0, ALPHA_MIN, 0.99, 1], profile=GSPLAT_MAIN._replace(alpha_min=ALPHA_MIN)),
         BEHIND,
     ),
-    Kind("opacities-of-bytes", "k / 255, as .splat files hold them: 1 / 255 is alpha_min", SHARP, _of_bytes, BEHIND),
+    Kind("opacities-of-bytes", "k / 255, as .splat files hold them: 1 / 255 is alpha_min", SHARP, _pick_bytes, BEHIND),
     Kind("logits-plus-minus-40", "opacities of 0 and 1 but for rounding", SHARP, _logits, BEHIND),
     Kind(
         "coincident-means", "eight at each place, of one depth to all digits", "in the order of the rows", _coincident
@@ -334,11 +334,11 @@ KINDS = (
     Kind("turns-on-axes", "quaternions with zeros, and scales that are equal", "finite gradients", _align_with_axes),
     Kind("channels-1", "one channel, where kernels keep three", "as many channels", _channels(1)),
     Kind("channels-4", "one more channel than kernels keep together", "as many channels", _channels(4)),
-    Kind("tile-edges", "centres and boxes on edges of tiles and pixels", "each in all its tiles", _on_tile_edges),
-    Kind("inria", "boxes of three sigma, whole tiles", "INRIA's image and gradient", _by(INRIA)),
-    Kind("gsplat-1.5", "alpha up to 0.999", "its image and gradient", _by(GSPLAT_1_5)),
-    Kind("mini-splatting2", "tight boxes, INRIA's stop", "its image and gradient", _by(MINI_SPLATTING2)),
-    Kind("antialiased", "compensations from their floor to one", "dimmed dots", _by(ANTIALIASED)),
+    Kind("tile-edges", "centres and boxes on edges of tiles and pixels", "each in all its tiles", _hit_tile_edges),
+    Kind("inria", "boxes of three sigma, whole tiles", "INRIA's image and gradient", _follow(INRIA)),
+    Kind("gsplat-1.5", "alpha up to 0.999", "its image and gradient", _follow(GSPLAT_1_5)),
+    Kind("mini-splatting2", "tight boxes, INRIA's stop", "its image and gradient", _follow(MINI_SPLATTING2)),
+    Kind("antialiased", "compensations from their floor to one", "dimmed dots", _follow(ANTIALIASED)),
     Kind("everything", "all of it at once", SHARP, _everything, LONG),
 )
 

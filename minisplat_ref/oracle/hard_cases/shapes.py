@@ -20,7 +20,7 @@ RIDGE = "a ridge without holes; the gradient that the float64 formula has"
 DIAGONAL, TILTED = rotation_quat(np.pi / 4), rotation_quat(0.3)
 
 
-def _with_quats(factor: float) -> Parameters:
+def _scale_quats(factor: float) -> Parameters:
     population = cloud()
     return Parameters(population._replace(quats=round_to_float32(population.quats * factor)), camera())
 
@@ -222,19 +222,19 @@ SHAPES = (
         "huge-quaternions",
         "|q| = 1e30: its square is beyond float32",
         "length does not matter",
-        lambda: _with_quats(1e30),
+        lambda: _scale_quats(1e30),
     ),
     HardCase(
         "tiny-quaternions",
         "|q| = 1e-30: its square is 0 in float32",
         "length does not matter",
-        lambda: _with_quats(1e-30),
+        lambda: _scale_quats(1e-30),
     ),
     HardCase(
         "subnormal-quaternions",
         "|q| = 1e-38: half of the entries are subnormal, 1 / |q| nearly overflows",
         "length does not matter; the gradient, 1e38 times larger, is finite",
-        lambda: _with_quats(1e-36),
+        lambda: _scale_quats(1e-36),
     ),
     HardCase(
         "half-turns",

@@ -181,12 +181,12 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
         gradient = render_vjp(tape, v["image"], v["alpha"])
         blocks = {**gradient.gaussians._asdict(), **gradient._asdict()}
         del blocks["gaussians"], blocks["means2d"], blocks["shared"]
-        return blocks | {"opacity_logits": _by_opacity(subject.gaussians.opacity_logits, blocks["opacity_logits"])}
+        return blocks | {"opacity_logits": _normalise(subject.gaussians.opacity_logits, blocks["opacity_logits"])}
 
     return Drawing(outputs, vjp, ("image", "alpha"))
 
 
-def _by_opacity(logits: Floats, v_logits: Floats) -> Floats:
+def _normalise(logits: Floats, v_logits: Floats) -> Floats:
     """Divide gradients with respect to logits by o (1 - o): near the ends they are too small to be compared."""
     small = np.exp(-np.abs(logits))  # float64, all digits
     slopes = small / (1 + small) ** 2

@@ -96,7 +96,7 @@ def _own_gradients(kind: str, vjp: Callable[..., Any], call: Call) -> dict[str, 
 def _run_numpy(function: Callable[..., Any], call: Call, _: bool) -> Result:
     copies = {name: value.copy() for name, value in call.leaves.items()}
     colors, alphas, meta = _parts(function(**copies, **call.others))
-    return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), {}, {})
+    return Result(_numpy(colors), _numpy(alphas), _list_arrays(meta), {}, {})
 
 
 def _run_torch(function: Callable[..., Any], call: Call, is_differentiated: bool) -> Result:
@@ -114,7 +114,7 @@ def _run_torch(function: Callable[..., Any], call: Call, is_differentiated: bool
         named = [(name, None if v is None else _numpy(v)) for name, v in zip([*leaves, *between], found, strict=True)]
         gradients = {name: v for name, v in named[: len(leaves)] if v is not None}
         of_meta = {name: v for name, v in named[len(leaves) :] if v is not None}
-    return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), gradients, of_meta)
+    return Result(_numpy(colors), _numpy(alphas), _list_arrays(meta), gradients, of_meta)
 
 
 def _run_jax(function: Callable[..., Any], call: Call, is_differentiated: bool) -> Result:
@@ -129,7 +129,7 @@ def _run_jax(function: Callable[..., Any], call: Call, is_differentiated: bool) 
         # A cotangent has to have the dtype of its output, which may differ from that of the arguments.
         cotangents = _to_jax(call.v_colors).astype(colors.dtype), _to_jax(call.v_alphas).astype(alphas.dtype)
         gradients = {name: _numpy(v) for name, v in pull(cotangents)[0].items()}
-    return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), gradients, {})
+    return Result(_numpy(colors), _numpy(alphas), _list_arrays(meta), gradients, {})
 
 
 def _jax_precision(dtype: np.dtype) -> AbstractContextManager[Any]:
@@ -154,7 +154,7 @@ def _parts(returned: Any) -> tuple[Any, Any, Mapping[str, Any]]:
     return returned[0], returned[1], meta if isinstance(meta, Mapping) else {}
 
 
-def _arrays_of(meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _list_arrays(meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {name: _numpy(meta[name]) for name in (*INTERMEDIATE, *_TOLD) if meta.get(name) is not None}
 
 

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.mechanisms.cameras.gsplat_call import GRADIENTS, STEPS, rasterization, rasterization_vjp
-from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED
-from minisplat_ref.mechanisms.cameras.oracle.profiles import PROFILES
+from minisplat_ref.mechanisms.cameras.oracle.planted import PLANTED, PROFILES
 from minisplat_ref.mechanisms.cameras.oracle.scenes import LEAVES, scenes
 from minisplat_ref.oracle.call_comparison import Arrays, Call, StageArray
 from minisplat_ref.oracle.tolerances import EXACT, GRADIENT, IMAGE, POSITION, UNSCENTED

@@ -38,7 +38,7 @@ def _radial(k1: float) -> dict[str, Any]:
     return {**PINHOLE, "radial_coeffs": np.array([[k1, 0, 0, 0, 0, 0]])}
 
 
-def _at(r: float, angle: float) -> tuple[float, float, float]:
+def _place(r: float, angle: float) -> tuple[float, float, float]:
     """Return the place at a distance r and an angle from the axis towards x, radians."""
     return float(r * np.sin(angle)), 0.0, float(r * np.cos(angle))
 
@@ -58,7 +58,7 @@ CASES = (
     ),
     HardCase(
         "pinhole: the mean beyond the border",
-        _at(4, np.arctan(18 / 32)),
+        _place(4, np.arctan(18 / 32)),
         0.5,
         PINHOLE,
         {(CENTER, SIZE - 1): _ball(4, np.arctan(18 / 32) - np.arctan(15 / 32), 0.5)},
@@ -66,7 +66,7 @@ CASES = (
     HardCase("pinhole: behind the camera", (0, 0, -4.0), 0.3, PINHOLE, {(CENTER, CENTER): 0.0}),
     HardCase(
         "lens: moved to a pixel's centre by a focal length that its distortion divides",
-        _at(4, np.arctan(0.25)),
+        _place(4, np.arctan(0.25)),
         0.1,
         {**_radial(-0.2), "focal": 8 / _SLOPE},
         {(CENTER, CENTER + 8): OPACITY},
@@ -74,7 +74,7 @@ CASES = (
     HardCase("lens: beyond the fold, whose image is inside", (4.0, 0, 2.0), 0.1, _radial(-0.2), {(CENTER, 29): 0.0}),
     HardCase(
         "fisheye: beyond 90 degrees",
-        _at(4, 14 / 8),
+        _place(4, 14 / 8),
         0.4,
         FISHEYE,
         {(CENTER, CENTER + 14): OPACITY, (CENTER, CENTER + 13): _ball(4, 1 / 8, 0.4)},

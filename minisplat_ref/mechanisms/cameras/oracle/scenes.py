@@ -29,7 +29,7 @@ def scenes() -> tuple[CallScene, ...]:
     """Return the scenes."""
     return (
         _scene("brown", "all coefficients of a distorting lens", 0, _ahead(50, 0), 41.5, {**BROWN, **ALONG_RAYS}),
-        _scene("fisheye", "up to 130 degrees from the axis", 1, _around(70, 1), 12.0, {**FISHEYE, **ALONG_RAYS}),
+        _scene("fisheye", "up to 130 degrees from the axis", 1, _surround(70, 1), 12.0, {**FISHEYE, **ALONG_RAYS}),
         _scene("hard", "beyond a fold, behind, at the border, around", 2, _hard(), 41.5, {**FOLDING, **ALONG_RAYS}),
         _scene("ortho", "parallel rays", 3, _ahead(50, 3), 16.0, {"camera_model": "ortho"}),
     )
@@ -76,7 +76,7 @@ def _ahead(n: int, seed: int) -> dict[str, Floats]:
     return _gaussians(rng.normal(size=(n, 3)) * (1, 1, 0.5) + (0, 0, 3.5), rng)
 
 
-def _around(n: int, seed: int) -> dict[str, Floats]:
+def _surround(n: int, seed: int) -> dict[str, Floats]:
     """Return Gaussians around the camera, at distances from 1.5 to 4."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(n, 3)) + np.array([0, 0, 0.3])

@@ -85,7 +85,7 @@ def rasterization_2dgs(
     ids, pixels = _hits((means, quats, scales, opacities), viewmats, Ks, (width, height), planes)
     blended = means2d, transforms, opacities[None], values, normals
     (image, alpha, shown), weights, transmittances = _accumulate(gsplat, blended, ids, pixels, (width, height))
-    median, distortion = _along_rays(weights, transmittances, values[0, :, -1][ids], pixels, (width, height))
+    median, distortion = _measure_rays(weights, transmittances, values[0, :, -1][ids], pixels, (width, height))
     behind = torch.cat([backgrounds, torch.zeros_like(backgrounds[:, :1])], 1)
     image = image + behind[:, None, None] * (1 - alpha)
     expected = image[..., -1:] / alpha.clamp(min=1e-10)
@@ -143,7 +143,7 @@ def _accumulate(
     return results, kept[0], kept[1]
 
 
-def _along_rays(
+def _measure_rays(
     weights: Tensor, transmittances: Tensor, z: Tensor, pixels: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """Return the median depth and the distortion [1, H, W, 1] of the hits, as :mod:`..ray_measures` defines them."""

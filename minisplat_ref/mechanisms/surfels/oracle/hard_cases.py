@@ -41,7 +41,7 @@ def _low_pass(distance: float, opacity: float) -> float:
     return opacity * float(np.exp(-(distance**2)))
 
 
-def _on_plane(opacity: float, scale: float, mean: Sequence[float], quat: Sequence[float], column: int) -> float:
+def _meet_plane(opacity: float, scale: float, mean: Sequence[float], quat: Sequence[float], column: int) -> float:
     """Return alpha on the middle row where the ray meets the plane of a disc turned about y: one line of a triangle.
 
     The disc's first axis is (cos 2a, 0, -sin 2a). The ray x = z s meets it where ``m_x + t cos = s (m_z - t sin)``.
@@ -68,7 +68,7 @@ CASES = (
     HardCase(
         "at a grazing angle",
         (((0.5, 0.0, 4.0), GRAZING, 1.5, 0.9),),
-        {(CENTER, CENTER + k): _on_plane(0.9, 1.5, (0.5, 0, 4), GRAZING, CENTER + k) for k in (3, 6)},
+        {(CENTER, CENTER + k): _meet_plane(0.9, 1.5, (0.5, 0, 4), GRAZING, CENTER + k) for k in (3, 6)},
     ),
     HardCase("behind the camera", (((0.0, 0.0, -4.0), FACING, 0.5, 0.8),), {(CENTER, CENTER): 0.0}),
     HardCase("before the near plane", (((0.0, 0.0, 0.005), FACING, 0.5, 0.8),), {(CENTER, CENTER): 0.0}),

@@ -52,7 +52,7 @@ def _three_sigma(surfels: Surfels, primitives: Any, camera: Any) -> Surfels:
     return surfels._replace(radii=np.ceil(surfels.radii * (3 / 3.33)).astype(np.int32))
 
 
-def _without_principal_point(surfels: Surfels, primitives: Any, camera: Any) -> Surfels:
+def _drop_principal_point(surfels: Surfels, primitives: Any, camera: Any) -> Surfels:
     T = surfels.transforms.copy()
     T[:, 0] -= camera.cx * T[:, 2]
     return surfels._replace(transforms=T)
@@ -119,7 +119,7 @@ def _forward_differences(depth: Floats, camera: Any) -> Floats:
 PLANTED: Mapping[str, PlantedInCall] = {
     "projected-center": PlantedInCall("low-pass at the projected centre", "projection", _projected(_projected_centers)),
     "three-sigma": PlantedInCall("radii of 3 standard deviations", "projection", _projected(_three_sigma)),
-    "no-principal-point": PlantedInCall("rays without c_x", "projection", _projected(_without_principal_point)),
+    "no-principal-point": PlantedInCall("rays without c_x", "projection", _projected(_drop_principal_point)),
     "unturned-normals": PlantedInCall("normals not turned to the camera", "projection", _projected(_unturned)),
     "moved-low-pass": PlantedInCall("low-pass 0.3 px off", "alpha", _shown(_moved_low_pass)),
     "clamp-0.99": PlantedInCall("alpha clamped at 0.99", "alpha", _shown(_clamp_sooner)),
