@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import dblquad
 
 from data_tools.claims import analytic as footprint
-from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.app.cli import main
@@ -281,17 +280,3 @@ def test_trains_evaluates_and_renders(tmp_path):
     ours, theirs = (sorted((tmp_path / name).glob("*.png")) for name in ("ours", "theirs"))
     assert len(ours) == 8 and all(a.read_bytes() != b.read_bytes() for a, b in zip(ours, theirs, strict=True))
     assert len(load_ply(run / "point_cloud.ply").means) > 0
-
-
-def test_the_study_finds_what_the_docstring_says(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(footprint, "SIGMAS", (0.1, 1.0))
-    out = tmp_path / "study"
-    assert measure_claim(["analytic/footprint", "--out", str(out)]) == 0
-    errors = json.loads((out / "result.json").read_text())["errors"]
-    assert errors["round"]["integral, logistic"][0] < 1e-3 < 0.1 < errors["round"]["Mip filter"][0]
-    assert errors["round"]["dilation"][0] > 10 > errors["round"]["centre"][0] > 1
-    assert 0.02 < errors["needle"]["integral, erf"][0] < 0.2
-    assert (out / "figure.png").stat().st_size > 10_000 and "| needle " in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="2"):
-        measure_claim(["analytic/footprint", "--places", "0", "--out", str(tmp_path / "none")])
-    assert not (tmp_path / "none").exists()

@@ -1,6 +1,5 @@
 """Anti-aliasing: sampling intervals, the 3D filter and its gradient, where it is 3DGS, training end to end."""
 
-import json
 from functools import partial
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
-from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.app.cli import main
@@ -233,7 +231,7 @@ def test_a_wrong_gradient_is_found():
     assert report.n_failed == 2 and "log_scales is wrong" in report.cases[0].note
 
 
-# --- what the studies measure with ---
+# --- measures ---
 
 
 def test_blocks_and_cameras_fit():
@@ -326,25 +324,3 @@ def test_it_trains_on_photographs(shared_data, tmp_path):
     assert main(["train", fox, *options]) == 0
     sigmas = load_ply(tmp_path / "fox" / "point_cloud.ply", FilteredGaussians).filter_sigmas
     assert sigmas.min() > 0 and np.ptp(sigmas) > ROUNDED_TO_FLOAT32
-
-
-def test_the_study_measures_all_recipes(tmp_path, capsys):
-    out, larger = tmp_path / "study", {**SCENE, "width": 64, "height": 48}
-    write_scene(make_scene("room", supersampling=1, **larger), tmp_path / "scene", larger)
-    options = [str(tmp_path / "scene"), "--downscale", "2", "--iterations", "30", "--seeds", "1", "--out", str(out)]
-    assert measure_claim(["antialiasing/zoom", *options]) == 0
-    result = json.loads((out / "result.json").read_text())
-    assert result["zooms"] == [0.25, 0.5, 1.0, 2.0]
-    psnr = {name: seeds[0] for name, seeds in result["psnr"].items()}
-    assert [name for name in psnr if "," not in name] == [
-        "3dgs-accel",
-        "3D filter alone",
-        "2D filter alone",
-        "antialiasing",
-        "analytic",
-    ]
-    assert psnr["antialiasing"][0] > psnr["3dgs-accel"][0]  # from far
-    assert len({tuple(values) for values in psnr.values()}) == len(psnr) == 8
-    assert (out / "figure.png").stat().st_size > 10_000 and "| analytic " in capsys.readouterr().out
-    assert measure_claim(["antialiasing/zoom", "nowhere", "--out", str(tmp_path / "none")]) == 2
-    assert "neither a folder nor one of" in capsys.readouterr().err and not (tmp_path / "none").exists()

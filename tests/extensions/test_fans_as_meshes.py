@@ -8,8 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
-from data_tools.claims.__main__ import main as measure_claim
-from data_tools.claims.fans.profile import fan_profile, mass, profile_error
+from data_tools.claims.fans.profile import fan_profile
 from gltf import glb_parts, only_primitive, values
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
@@ -49,7 +48,6 @@ from tolerances import (
     PARITY_FLOAT32_GRADIENT,
     PARITY_FLOAT64,
     PRINTED_DIGITS,
-    PROFILE_GRID,
     ROUNDED_TO_FLOAT32,
 )
 
@@ -151,15 +149,6 @@ def test_a_fan_seen_from_the_front_has_the_profile(backend):
     expected = fan_profile(np.stack([x, y], axis=-1), FLAT) / (1 + np.exp(-1))
     assert expected.max() > 0.7 and (expected == 0).any()
     assert_allclose(alpha, expected, atol=100 * CLOSED_FORM)
-
-
-def test_the_error_and_the_mass_of_profiles():
-    """Closed form of the mass by a sum; the best fan of eight sides errs by 12 %."""
-    axis = np.arange(-4, 4, 0.01)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
-    for shape in (FanShape(), FLAT, FanShape(3, 2.0, 0.5)):
-        assert fan_profile(grid, shape).sum() * 1e-4 / (2 * np.pi) == pytest.approx(mass(shape), rel=PROFILE_GRID)
-    assert [round(profile_error(s), 2) for s in (FanShape(reach=2.5), FanShape(reach=2.3, rim=0.2))] == [0.12, 0.26]
 
 
 # --- the renderer ---
@@ -454,27 +443,6 @@ def test_models_that_hold_nothing_are_refused(model, scene_folder, tmp_path, cap
     with pytest.raises(SystemExit, match="2"):
         main([*tune, str(out), "--iterations", "0"])
     assert "--iterations" in capsys.readouterr().err
-
-
-def test_the_studies(scene_folder, model, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("data_tools.claims.fans.measures.REACHES", (2.5,))
-    monkeypatch.setattr("data_tools.claims.fans.measures.SIDES", (4, 8))
-    monkeypatch.setattr("data_tools.claims.fans.measures.VIEWS_MAX", 1)
-    monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.EVALUATIONS", 4)
-    monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.FIRST_REACHES", (2.5,))
-    monkeypatch.setattr("data_tools.claims.fans.profile.ANGLES", (0, 90))
-    refit, profile = tmp_path / "refit", tmp_path / "profile"
-    options = ["--ply", str(model), "--fine-tune", "3", "--out", str(refit)]
-    assert measure_claim(["fans/refit", str(scene_folder), *options]) == 0
-    (run,) = json.loads((refit / "result.json").read_text())["runs"]
-    assert [row["form"] for row in run["rows"] if "triangles" in row][::3] == ["flat fans", "solid fans"]
-    assert (refit / "figure.png").stat().st_size > 10_000 and "| flat fans, vertices" in capsys.readouterr().out
-    assert sorted(path.name for path in refit.iterdir()) == ["figure.png", "result.json"]
-    assert measure_claim(["fans/profile", "--out", str(profile)]) == 0
-    tilts = json.loads((profile / "result.json").read_text())["tilts"]
-    edge_on = {(tilt["kind"], tilt["is_flat"]): tilt["errors"][1] for tilt in tilts}
-    assert edge_on["ball", True] > 0.99 > edge_on["ball", False]
-    assert "| 8     | 2.50  | 0.00 | 12.3%     | 0.94 |" in capsys.readouterr().out
 
 
 def test_fans_of_sparse_points_face_everywhere(rng):

@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.spatial import cKDTree
 
-from data_tools.claims import games as study
-from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
@@ -215,34 +212,3 @@ def test_bad_input(case, trained, mesh, capsys, monkeypatch):
     assert main(words) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and not (trained / "no").exists()
-
-
-# The study
-
-
-def test_the_study_compares_on_and_off_the_faces(tmp_path, monkeypatch, wall, capsys):
-    monkeypatch.setattr(study, "make_scene", lambda name: wall)
-    monkeypatch.setattr(study, "ARMS", (("exact mesh", 1),))
-    monkeypatch.setattr(study, "VOXEL", 0.5)
-    assert measure_claim(["games/counts", "x", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| exact")]
-    assert len(lines) == 2
-    counts = [line.split("|")[2].strip() for line in lines]
-    assert counts[0] == counts[1] and "on it" in lines[0] and "free" in lines[1]
-
-
-def test_the_free_arm_has_no_density_control():
-    recipe = study.unbound(100)
-    assert recipe.events == () and recipe.name == "3dgs-accel" and recipe.iterations == 100
-
-
-def test_the_median_of_what_is_opaque_is_measured(wall, rng):
-    """Of distances 0, 0.01, 0.5 and 9, whose last is of a Gaussian of opacity 0.09: the median is 0.01."""
-    points = study.true_points(wall)
-    g = as_dtype(make_gaussians(rng, 4), np.float32)
-    normal = np.eye(3)[np.argmin(np.ptp(points, axis=0))]
-    means = points[100] + np.array([0.0, 0.01, 0.5, 9.0])[:, None] * normal
-    logits = np.array([2.0, 2.0, 2.0, np.log(0.09 / 0.91)])
-    g = g._replace(means=means.astype(np.float32), opacity_logits=logits.astype(np.float32))
-    found = study.outcome(wall, cKDTree(points), g, study.unbound(1))
-    assert found["n_gaussians"] == 4 and found["distance"] == pytest.approx(0.01, rel=0.05)

@@ -1,4 +1,4 @@
-"""GDGS: attraction and crowding by hand, the start on planes, control by regions, the command line, the study."""
+"""GDGS: attraction and crowding by hand, the start on planes, control by regions, the command line."""
 
 import json
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from data_tools.claims.gdgs.sphere import measure
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
@@ -204,10 +203,3 @@ def test_the_recipe_trains_through_the_command_line(tmp_path):
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["n_gaussians"] > 0
     names = {action_name(event) for event in find_recipe("gdgs").events}
     assert "control_by_region" in names
-
-
-def test_the_study_measures_what_each_term_does():
-    found = measure(80, 0)
-    assert found["attraction"]["distance"] < 0.7 * found["points"]["distance"]
-    assert found["predictor and planes"]["angle"] < 0.5 * found["points"]["angle"]
-    assert found["attraction and contraction"]["spacing"] > 1.3 * found["attraction"]["spacing"]

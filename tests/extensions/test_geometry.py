@@ -1,15 +1,11 @@
 """Optional loss terms on the rendered depth: SfM points, smooth depth, smooth normals."""
 
-import json
-
 import numba
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_inner_products, check_jacobian
-from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.geometry import EXTENSION, kernels, reference
 from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
 from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smoothness, normal_smoothness_vjp
@@ -409,14 +405,3 @@ def test_backends_agree(fast_backend, term, dtype, is_masked, rng):
     for v, e in zip(functions_of(fast_backend).geometric_loss_vjp(tape, 2.0), v_expected, strict=True):
         assert v.dtype == dtype and np.abs(e).max() > GRADIENT_FLOOR
         assert_allclose(v, e, rtol=0, atol=tolerance * np.abs(e).max())
-
-
-def test_the_study_measures_depths(tmp_path, capsys, monkeypatch):
-    tiny = {"n_views": 8, "width": 48, "height": 36, "n_points": 200, "supersampling": 1, "test_every": 4}
-    monkeypatch.setattr("data_tools.claims.geometry.make_scene", lambda name: make_scene(name, **tiny))
-    out = tmp_path / "study"
-    options = ["--iterations", "120", "--seeds", "1", "--out", str(out)]
-    assert measure_claim(["geometry/depth", "room", *options]) == 0
-    records = {r["arm"]: r for r in json.loads((out / "result.json").read_text())["records"]}
-    assert records["sfm_depth"]["median_error"] < records["without"]["median_error"] < 0.5
-    assert (out / "figure.png").stat().st_size > 10_000 and "| all three" in capsys.readouterr().out

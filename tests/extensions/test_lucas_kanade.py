@@ -8,9 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import gaussian_filter, shift
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.lucas_kanade import body as bodies
-from data_tools.claims.lucas_kanade import trainings as study
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -41,7 +39,7 @@ from minisplat_ref.oracle.loss_terms import loss_cases
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.rendering import SPLATTING, Request, activate
+from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered
@@ -510,45 +508,6 @@ def test_order_of_given_depths(rng, tmp_path):
     assert value > 0.01 and v.channels["depth"].any() and v.alpha.any()
     with pytest.raises(InputError, match="which view sees which point"):
         depth_order(rendered, depths="", margin=0.0)
-
-
-# --- the study ---
-
-
-def test_the_body_turns_and_grows(rng):
-    """Its Gaussians at time 1 are those at 0, turned by one radian and a quarter larger, as covariances too."""
-    body = bodies.make_body(rng)
-    start, end = body.at(0.0), body.at(1.0)
-    assert_allclose(np.linalg.norm(end.means, axis=1), 1.25 * np.linalg.norm(start.means, axis=1), rtol=1e-5)
-    across = [g.means - np.outer(g.means @ bodies.AXIS, bodies.AXIS) for g in (start, end)]
-    cosines = np.sum(across[0] * across[1], axis=1) / np.prod([np.linalg.norm(a, axis=1) for a in across], axis=0)
-    assert_allclose(cosines, np.cos(1.0), atol=1e-4)  # float32, of centres near the axis
-    flat = [rotation_matrices(g.quats)[:, :, 2] for g in (start, end)]  # normals
-    assert_allclose(np.sum(flat[0] * start.means, axis=1), np.sum(flat[1] * end.means, axis=1) / 1.25, atol=1e-5)
-    assert_allclose(activate(end).scales, 1.25 * activate(start).scales, rtol=1e-5)
-
-
-def test_forms_are_measured(capsys):
-    assert measure_claim(["lucas-kanade/forms", "--seeds", "1"]) == 0
-    lines = [line.strip("| ").split("|") for line in capsys.readouterr().out.splitlines()]
-    errors = {line[0].strip(): float(line[1]) for line in lines[2:]}
-    assert errors["(i) and (iii), the latter by differences"] < 1e-7 and errors["(i) and J (ii)"] < 1e-12
-    assert errors["Runge-Kutta from time 0 to 1 in 8 steps"] < 1e-4 < errors["fitted warp and the body"] < 0.1
-
-
-def test_the_study_measures_its_arms(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(bodies, "N_GAUSSIANS", 60)
-    monkeypatch.setattr(bodies, "N_FRAMES", 6)
-    for name, value in (("WIDTH", 48), ("HEIGHT", 32), ("FOCAL", 55.0)):
-        monkeypatch.setattr(bodies, name, value)
-    out = tmp_path / "out"
-    assert measure_claim(["lucas-kanade/body", "--iterations", "30", "--seeds", "0", "--out", str(out)]) == 0
-    records = {record["arm"]: record for record in json.loads((out / "result.json").read_text())["records"]}
-    assert list(records) == [f"{camera}, {arm}" for camera in study.CAMERAS for arm in study.LOSSES]
-    for camera in study.CAMERAS:
-        without, _, true = (records[f"{camera}, {arm}"] for arm in study.LOSSES)
-        assert true["flow"] < without["flow"] and true["path"] < without["path"]
-    assert "| still, no flow loss" in capsys.readouterr().out
 
 
 # --- from a folder of photographs to images ---

@@ -8,8 +8,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
-from data_tools.claims.__main__ import main as measure_claim
-from data_tools.claims.micro.counts import CURVES
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.progress import Progress
@@ -355,27 +353,3 @@ def test_a_setting_that_it_does_not_have_is_refused(scene_folder, tmp_path, caps
     options = ["--recipe", "micro", "--set", "traces=1", "--out", str(tmp_path / "run")]
     assert main(["train", str(scene_folder), *options]) == 2
     assert "has no traces to set" in capsys.readouterr().err and not (tmp_path / "run").exists()
-
-
-def test_the_study_measures_at_equal_count(tmp_path, capsys):
-    out = tmp_path / "study"
-    assert measure_claim(["micro/checker", "--iterations", "130", "--seeds", "1", "--out", str(out)]) == 0
-    found = json.loads((out / "result.json").read_text())["variants"]
-    assert {tuple(numbers["n"]) for numbers in found.values()} == {(840,)}
-    assert found["both"]["psnr_edges"][0] > found["3dgs"]["psnr_edges"][0]
-    assert (out / "figure.png").stat().st_size > 10_000
-    assert "| both " in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="2"):
-        measure_claim(["micro/checker", "--seeds", "0", "--out", str(tmp_path / "none")])
-    assert not (tmp_path / "none").exists()
-
-
-def test_the_study_measures_quality_against_count(scene_folder, tmp_path, capsys, monkeypatch):
-    short = {name: curve._replace(points=curve.points[:1]) for name, curve in CURVES.items()}
-    monkeypatch.setattr("data_tools.claims.micro.counts.CURVES", short)
-    out = tmp_path / "counts"
-    options = ["--iterations", "300", "--seeds", "1", "--out", str(out)]
-    assert measure_claim(["micro/counts", str(scene_folder), *options]) == 0
-    plain, first, both = json.loads((out / "result.json").read_text())["records"]
-    assert both["n_gaussians"] < first["n_gaussians"] and plain["settings"] == {"threshold": 2e-4}
-    assert (out / "figure.png").stat().st_size > 10_000 and "| micro, first stage alone | " in capsys.readouterr().out

@@ -8,7 +8,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
-from data_tools.claims.__main__ import main as measure_claim
 from gradcheck import check_inner_products
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.app.cli import main
@@ -359,16 +358,3 @@ def test_it_trains_on_photographs(shared_data, tmp_path):
     options = ["--downscale", "4", "--recipe", "multi-scale", "--iterations", "20", "--out", str(tmp_path / "fox")]
     assert main(["train", fox, *options]) == 0
     assert load_ply(tmp_path / "fox" / "point_cloud.ply", MultiScaleGaussians).cells[:, 0].any()
-
-
-def test_the_study_compares_at_every_size(scene_folder, tmp_path, capsys):
-    out = tmp_path / "study"
-    options = [str(scene_folder), "--iterations", "40", "--seeds", "1", "--out", str(out)]
-    assert measure_claim(["multi-scale/downscale", *options]) == 0
-    result = json.loads((out / "result.json").read_text())
-    assert result["blocks"] == [1, 2, 4, 8]
-    pairs = {name: figures["n_pairs"][0] for name, figures in result["figures"].items()}
-    assert pairs["levels 2"][-1] < pairs["3dgs"][-1]
-    assert (out / "figure.png").stat().st_size > 10_000 and "| too early " in capsys.readouterr().out
-    assert measure_claim(["multi-scale/downscale", "room", "--downscale", "2", "--out", str(tmp_path / "none")]) == 2
-    assert not (tmp_path / "none").exists()

@@ -1,17 +1,15 @@
-"""MVG-Splatting: levels, steps and insertions by hand, its losses, the recipe by the command line, the study."""
+"""MVG-Splatting: levels, steps and insertions by hand, its losses, the recipe by the command line."""
 
 import json
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
-from data_tools.claims import mvg as study
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.mvg import insertion, method
+from minisplat_ref.extensions.mvg import method
 from minisplat_ref.extensions.mvg.insertion import Insertions, Photographed, Rules, propose, uncovered
 from minisplat_ref.extensions.mvg.losses import depth_steps, filtered_normals
 from minisplat_ref.extensions.mvg.method import MVG, facing, photographed, surfels_at
@@ -262,7 +260,7 @@ def test_the_gradients_of_the_losses():
         assert cases and all(case.passed for case in cases), name
 
 
-# --- the recipe and the study ---
+# --- the recipe ---
 
 
 def test_the_recipe_trains_through_the_command_line(tmp_path, capsys):
@@ -317,53 +315,3 @@ class _Iteration:
 
     def __init__(self, scene):
         self.scene = scene
-
-
-@pytest.fixture(scope="module")
-def records():
-    found = study.measure("staircase", 8, 0, width=80, height=60)
-    return {(r["kind"], r["share"], r["arm"]): r for r in found}
-
-
-def test_the_test_leaves_few_scattered_errors(records):
-    for share in study.SHARES:
-        wrong = {arm: records["scattered", share, arm]["wrong"] for arm in study.ARMS}
-        # Wrong depths are near or far more often than the others, so they are more than their share of the points.
-        assert 100 * share < wrong["neither filter nor test"] < 150 * share
-        assert wrong["2 views agree"] < 0.2 * wrong["neither filter nor test"]
-        assert wrong["filter, 2 views agree"] < wrong["filter, 1 view agrees"] < wrong["filter"]
-
-
-def test_the_study_has_a_cell_for_every_arm(records):
-    text = study.tables([r | {"seed": 0} for r in records.values()])
-    assert all(text.count(f"| {arm} ") for arm in (*study.ARMS, *study.EQUAL))
-    assert len(study.draw(list(records.values())).axes) == 2
-
-
-def test_spoilt_shares_are_those_asked_for(rng):
-    made = make_scene("staircase", n_views=4, width=40, height=30, supersampling=1, n_points=20, test_every=0)
-    cameras = [view.camera for view in made.scene.train_views]
-    depths = made.train_depths
-    has_depth = depths > 0
-    assert_allclose(np.mean((study.scatter(depths, cameras, 0.2, rng) != depths)[has_depth]), 0.2, atol=0.03)
-    balls = study.float_balls(depths, cameras, 0.1, rng)
-    assert 0.1 <= np.mean((balls != depths)[has_depth]) < 0.2 and (balls <= depths).all()
-
-
-def test_a_ball_by_hand():
-    """A ball of radius 0.5 at depth 4: its middle is 3.5 away; 4 pixels aside a ray passes at 4 sin(atan(0.4)) > 1."""
-    camera = Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 4.5, 4.5, 9, 9)
-    ball = study._ball_depth(camera, (9, 9), np.array([0, 0, 4.0]), 0.5)
-    assert_allclose(ball[4, 4], 3.5, rtol=CLOSED_FORM)
-    assert ball[4, 8] == 0 and ball[4, 5] > 3.5
-    assert_array_equal(ball, ball.T)
-
-
-def test_normals_of_the_truth_have_no_angle_on_planes():
-    made = make_scene("staircase", n_views=2, width=80, height=60, supersampling=1, n_points=20, test_every=0)
-    views = [
-        Photographed(DepthView(depth, view.camera), view.image / 255)
-        for depth, view in zip(made.train_depths, made.scene.train_views, strict=True)
-    ]
-    assert study.angle(views, made) < 1e-5
-    assert insertion.smooth_map(views[0]).seen.depth.shape == (60, 80)

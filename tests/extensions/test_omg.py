@@ -10,8 +10,7 @@ from scipy.cluster.vq import kmeans2
 
 from actions import act, scene_of, state_of
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
-from data_tools.claims.__main__ import main as measure_claim
-from minisplat_ref import load_ply, load_scene, save_ply
+from minisplat_ref import load_ply
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -23,11 +22,9 @@ from minisplat_ref.extensions.omg.method import prune_indistinct
 from minisplat_ref.extensions.omg.pack import read_training
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.omg.svq import fit_codes, quantise
-from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import indoor
-from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import action_name, firing_steps
 from minisplat_ref.training.state import Iteration
@@ -416,42 +413,3 @@ def test_a_file_is_in_the_frame_of_the_scene(folders):
     assert_allclose(moved.means, 8 * plain.means + [10, 20, -30], rtol=1e-6)
     assert_allclose(moved.log_scales, plain.log_scales + np.log(8), rtol=1e-6)
     assert_array_equal(moved.sh_dc, plain.sh_dc)
-
-
-def test_study_of_files(folders, tmp_path, capsys):
-    """Sizes and losses in the table are those of the files."""
-    nook, run = folders
-    checkpoint = run / "checkpoint.npz"
-    command = ["omg/files", str(nook), "--checkpoints", str(checkpoint), "--out", str(tmp_path / "out")]
-    assert measure_claim(command) == 0
-    (record,) = json.loads((tmp_path / "out" / "result.json").read_text())["runs"]
-    rows = {row["file"]: row for row in record["rows"]}
-    assert rows["as trained"]["lost"] == 0 and {".spz 0", ".msz 0", ".omg 4", ".omg of the training"} < set(rows)
-    assert rows[".omg of the training"]["n_bytes"] == len(trained_file.encode(*read_training(checkpoint)))
-    assert rows[".omg 2"]["n_bytes"] == len(omg.encode(load_ply(run / "point_cloud.ply"), 2))
-    assert abs(rows[".msz 0"]["lost"]) < 1e-6 < abs(rows[".omg 4"]["lost"])
-    assert ".omg of the training" in capsys.readouterr().out
-
-
-def test_study(folders, tmp_path, capsys):
-    nook, run = folders
-    command = ["omg/distinctiveness", str(nook), "--fine-tune", "3", "--seeds", "0", "--ply"]
-    save_ply(tmp_path / "two.ply", take(load_ply(run / "point_cloud.ply"), np.arange(2)))
-    few = [*command, str(tmp_path / "two.ply"), "--out", str(tmp_path / "few")]
-    assert measure_claim(few) == 2  # two Gaussians differ from each other alike: both choices keep the same
-    assert "'with distinctiveness' measured exactly what 'importance' did" in capsys.readouterr().err
-    save_ply(tmp_path / "more.ply", initial_state(load_scene(nook), get_recipe("3dgs"), seed=0).gaussians)
-    more = [*command, str(tmp_path / "more.ply"), "--out", str(tmp_path / "out")]
-    assert measure_claim(more) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    rows = result["runs"][0]
-    assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]
-    counts = [row["n_gaussians"] for row in rows]
-    assert counts == sorted(counts, reverse=True) and counts[1] == counts[2] < counts[0]
-    losses = {field: of_seeds[0] for field, of_seeds in result["losses"].items()}
-    assert set(losses) == set(Gaussians._fields) and all(len(of_levels) == 5 for of_levels in losses.values())
-    assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in images of 32 x 24
-    assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
-    assert "textured half" in capsys.readouterr().out
-    assert measure_claim(more) == 0  # continues: there is nothing left to measure
-    assert json.loads((tmp_path / "out" / "result.json").read_text()) == result

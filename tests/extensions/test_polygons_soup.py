@@ -1,12 +1,9 @@
-"""Polygon soups: files that go out and come back, edits carried to Gaussians, what is refused, and the studies."""
-
-import json
+"""Polygon soups: files that go out and come back, edits carried to Gaussians, and what is refused."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.polygons import edits as claims
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
@@ -16,7 +13,6 @@ from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
-from minisplat_ref.mechanisms.meshes.fans import flatten
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Gaussians
@@ -24,7 +20,6 @@ from scenes import as_dtype, make_gaussians
 from tolerances import AFFINE_EDIT, EDITED_IMAGE, PARITY_FLOAT64
 
 TURN = rotation_matrices(np.array([[0.8, 0.2, -0.4, 0.4]]))[0]
-SHIFT = np.array([0.3, -0.2, 0.1])
 
 
 def model(rng, n=30):
@@ -33,11 +28,6 @@ def model(rng, n=30):
     g.log_scales[np.arange(n), np.argmin(g.log_scales, axis=1)] -= 8
     g.opacity_logits[[3, 7]] = -9
     return g
-
-
-def planar(gaussians):
-    spans = flatten(gaussians.means, gaussians.quats, gaussians.log_scales).spans
-    return spans @ np.swapaxes(spans, 1, 2)
 
 
 def is_same(a, b):
@@ -89,24 +79,6 @@ def test_what_was_not_moved_keeps_its_bytes(files, tmp_path, capsys):
         assert main(["polygons", "edit", str(files[0]), str(tmp_path / f"{name}.ply"), "--out", str(out)]) == 0
         assert "0 of 30 Gaussians follow" in capsys.readouterr().out
         assert out.read_bytes() == files[0].read_bytes()
-
-
-@pytest.mark.parametrize("name", claims.MAPS)
-@pytest.mark.parametrize("n_sides", [3, 8])
-def test_an_affine_edit_is_the_gaussians_transformed(name, n_sides, rng):
-    before, A = model(rng), claims.MAPS[name]
-    soup = soup_of(before, n_sides)
-    after, n = carry_gaussians(before, soup, soup.corners @ A.T + SHIFT, "it")
-    assert n == 28
-    direct = planar(before)[soup.rows]
-    expected = A @ direct @ A.T
-    scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
-    assert_allclose(after.means[soup.rows], before.means[soup.rows] @ A.T + SHIFT, atol=AFFINE_EDIT)
-    assert_allclose(planar(after)[soup.rows] / scale, expected / scale, atol=AFFINE_EDIT)
-    assert is_same([f[[3, 7]] for f in after], [f[[3, 7]] for f in before])
-    again = soup_of(after, n_sides)
-    if name in ("turn", "turn and scale"):  # elsewhere the axes of the ellipse lie at other corners
-        assert_allclose(again.corners, soup.corners @ A.T + SHIFT, atol=AFFINE_EDIT)
 
 
 def test_colours_turn_along(rng):
@@ -246,7 +218,7 @@ def test_gaussians_of_no_finite_size_are_left_out(rng):
     assert_array_equal(soup_of(g, 8).rows, [i for i in range(30) if i not in (0, 1, 3, 7)])
 
 
-# --- bending, and the studies ---
+# --- bending ---
 
 
 def test_a_bent_soup_is_drawn_as_it_is(rng):
@@ -258,31 +230,3 @@ def test_a_bent_soup_is_drawn_as_it_is(rng):
     drawn = claims.render_soup(gaussians, soup, moved)
     assert drawn.min() < 0.5
     assert_allclose(claims.render_float64(after), drawn, atol=EDITED_IMAGE)
-
-
-def test_what_bending_costs_grows_with_the_angle_and_falls_with_the_number():
-    """As the size of a splat over the radius of the bend: twice for twice the angle, half for four times as many."""
-    by_angle = [claims.bend_errors(10, angle) for angle in (10, 20, 40)]
-    fit = [row["corners, fit"] for row in by_angle]
-    assert 1.9 < fit[1] / fit[0] < 2.1 and 1.9 < fit[2] / fit[1] < 2.1
-    assert all(row["corners, fit"] < row["corners, Gram-Schmidt"] for row in by_angle)
-    finer = claims.bend_errors(20, 20)
-    assert 1.8 < fit[1] / finer["corners, fit"] < 2.2
-    assert finer["light that passes, RMS"] < by_angle[1]["light that passes, RMS"]
-
-
-def test_the_studies_draw_and_print(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(claims, "ANGLES", (10, 20))
-    monkeypatch.setattr(claims, "PER_SIDE", (4, 8))
-    out = tmp_path / "study"
-    assert measure_claim(["polygons/edits", "--seeds", "1", "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
-    assert max(result["round trip"].values()) < PARITY_FLOAT64
-    for name, errors in result["affine"].items():
-        assert errors["covariance, fit"] < AFFINE_EDIT and errors["image"] < EDITED_IMAGE, name
-    assert result["affine"]["shear"]["covariance, Gram-Schmidt"] > 0.1
-    assert (out / "figure.png").stat().st_size > 20_000 and "| shear" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="2"):
-        measure_claim(["polygons/edits", "--seeds", "0", "--out", str(tmp_path / "none")])
-    with pytest.raises(SystemExit, match="2"):
-        measure_claim(["polygons/cost", "--repeats", "0"])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.rays import demo
 from data_tools.claims.rays import measures as claims
 from minisplat_ref.app.cli import main
@@ -221,10 +220,6 @@ def test_lamps_share_the_light_and_gaussians_have_no_cosine():
     assert_allclose(irradiance(half, points, None), 0.6, rtol=CLOSED_FORM)
 
 
-def test_the_edge_of_a_shadow_is_where_the_tangent_cone_meets_the_floor():
-    assert claims.shadow_edge()["pixels"] < 0.01
-
-
 def test_a_lamp_in_front_of_a_gaussian_is_not_dimmed_by_it(rng):
     """Only what lies between counts; a faint Gaussian between transmits its part."""
     veil = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.full((1, 3), 0.5))
@@ -299,19 +294,6 @@ def test_a_light_in_a_faint_gaussian_is_taken():
                 surroundings.check_lights(lit, gaussians, "it")
         else:
             surroundings.check_lights(lit, gaussians, "it")
-
-
-def test_the_study_draws_and_prints(tmp_path, capsys):
-    out = tmp_path / "study"
-    assert measure_claim(["rays/claims", "--gaussians", "60", "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
-    for name in ("tree against brute force", "tracing against exact order", "mirror against mirrored camera"):
-        assert result[name] < RAY_ORDER
-    errors = result["splatting against tracing"]["errors"]
-    assert all((np.diff(values) > 0).all() for values in errors.values())
-    assert (out / "figure.png").stat().st_size > 20_000 and "| edge of a shadow" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="2"):
-        measure_claim(["rays/claims", "--gaussians", "0", "--out", str(tmp_path / "none")])
 
 
 # --- a peer ---

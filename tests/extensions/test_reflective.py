@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims import reflective as study
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -217,43 +216,3 @@ def test_maps_asked_of_a_recipe_that_has_none(run_folder, capsys):
     assert "has no map albedo: it is drawn as splatting" in capsys.readouterr().err.splitlines()[-1]
     assert main(["render", ply]) == 2
     assert "no place for their light" in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_the_study_measures_what_it_says(monkeypatch):
-    """The truth has no error; a moved highlight is off; what is hidden is dark; the environment is approached."""
-    monkeypatch.setattr(study, "WIDTH", 32)
-    monkeypatch.setattr(study, "HEIGHT", 24)
-    monkeypatch.setattr(study, "STEPS", 4)
-    light, rng = prefilter(study.environment()), np.random.default_rng(0)
-    truths = [study.trace(camera, light, hides=True) for camera in study._cameras(rng)[:4]]
-    exact = []
-    for truth in truths:
-        normals = np.zeros((24, 32, 3))
-        normals[truth.is_sphere] = truth.normals @ truth.camera.cam_from_world_R.T
-        exact.append(np.concatenate([np.clip(truth.image, 0, 1), normals], axis=2))
-    with np.errstate(divide="ignore"):
-        found = study.compare(truths, exact)
-    assert found["psnr"] == np.inf and found["highlight"] == 0 and found["normal_error"] < 1e-5
-    moved = study.compare(truths, [np.roll(image, 2, axis=1) for image in exact])
-    assert moved["psnr"] < 30 and 0.5 < moved["highlight"] < 4
-    assert any(truth.is_hidden.any() for truth in truths)
-    records = study._occlusion(truths, rng)
-    assert records[1]["hidden_psnr"] > records[0]["hidden_psnr"] + 3
-    recovered = study.recover(truths, rng)
-    assert recovered["error_after"] < recovered["error_before"]
-
-
-def test_blending_by_centres_makes_normals_lean_towards_the_camera():
-    """As docs/FAMILY.md says: on a sphere, the blended normal is nearer to the view than the true one."""
-    [camera, *_] = study._cameras(np.random.default_rng(0))
-    truth = study.trace(camera, prefilter(study.environment()))
-    metal = study.metal_of(study.sphere_of(500, 0.0, np.random.default_rng(0)))
-    request = Request(wants=frozenset({"normal"}))
-    output, _ = REFLECTIVE.render(study.model_of(metal, PER_PIXEL), view_from(camera), request)
-    found = (
-        output.image[truth.is_sphere][:, 3:6] / np.linalg.norm(output.image[truth.is_sphere][:, 3:6], axis=1)[:, None]
-    )
-    rays = pinhole_rays(np.arange(96) + 0.5, np.arange(72)[:, None] + 0.5, camera)[truth.is_sphere]
-    to_camera = -rays / np.linalg.norm(rays, axis=1)[:, None]
-    expected = truth.normals @ camera.cam_from_world_R.T
-    assert (np.sum(found * to_camera, axis=1) > np.sum(expected * to_camera, axis=1)).mean() > 0.95

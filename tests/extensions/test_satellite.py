@@ -426,16 +426,6 @@ def test_other_cameras_are_refused(setting):
         SATELLITE.render(Model(setting.gaussians), view_from(setting.camera), Request(wants=frozenset({"surface"})))
 
 
-def test_boxes_truth():
-    """Heights are those of the boxes, walls are seen at a slant, and a shadow has the length that the sun says."""
-    box = boxes.Boxes(np.array([[-10.0, -10, 0]]), np.array([[10.0, 10, 12]]), np.ones((2, 2, 3)))
-    sun = np.array([-1.0, 0.0, 1.0])
-    _, heights, is_shadow = boxes.trace(box, boxes.zenith(96), sun)
-    assert heights[48, 48] == pytest.approx(12) and heights[48, 60] == pytest.approx(0)
-    dark = np.flatnonzero(is_shadow[48])
-    assert (dark[0], dark[-1]) == (58, 69)  # pixels of a metre: x from 10 to 22 m
-
-
 def test_light_in_shadows_stays_between_none_and_the_sun_s():
     state = initial_state(boxes.make_scene(0, n_points=8, size=4).scene, find_recipe("satellite", 10), 0)
     state.shared[IN_SHADOW][:2] = [[-0.1, 0.3, 1.7], [0.0, 1.0, 2.0]]

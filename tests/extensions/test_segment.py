@@ -2,7 +2,6 @@
 
 import json
 from collections import namedtuple
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.optimize import linprog
 
-from data_tools.claims import segment as study
-from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref.app.cli import main
-from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.segment.assignment import belongs, labels
@@ -293,42 +289,3 @@ def test_networks_that_no_ply_holds_are_refused(folder, masked, capsys):
     save_ply("run/point_cloud.ply", masked[0], Label("vdgs"))
     assert label_command("--out", "out.ply") == 2
     assert "is drawn by vdgs, with parameters that no PLY holds" in capsys.readouterr().err
-
-
-# The study
-
-
-def test_masks_are_shifted_and_lost():
-    mask = np.zeros((6, 8), int)
-    mask[1, 2] = 4
-    assert np.argwhere(study.shift(mask, 3, -1)).tolist() == [[4, 1]]
-    assert not study.shift(mask, -2, 0).any()
-    full = [np.full((20, 20), 1 + i) for i in range(10)]
-    spoiled = study.spoil(full, 0.3, 0.2, np.random.default_rng(1))
-    zeros = [int((m == 0).sum()) for m in spoiled]
-    assert sum(n == 400 for n in zeros) == 2  # lost
-    moved = [n for n in zeros if 0 < n < 400]
-    assert len(moved) == 3 and all(400 - 17 * 17 <= n <= 400 - 15 * 15 for n in moved)  # by 3 to 5 along both axes
-    assert all((m == 1 + i).any() or n == 400 for i, (m, n) in enumerate(zip(spoiled, zeros, strict=True)))
-    all_moved = study.spoil([np.ones((20, 20), int)] * 60, 1.0, 0.0, np.random.default_rng(1))
-    counts = np.array([[20 - m.any(axis=1).sum(), 20 - m.any(axis=0).sum()] for m in all_moved])
-    assert all(set(along) == {3, 4, 5} for along in counts.T)
-    starts = {tuple(np.argwhere(m)[0] > 0) for m in all_moved}
-    assert len(starts) == 4  # to either side, along both axes
-
-
-def test_iou_by_hand(monkeypatch):
-    monkeypatch.setattr("data_tools.claims.kit.objects.OBJECTS", ((1,), (2,)))
-    truth, found = np.array([[1, 1, 2, 0]]), np.array([[1, 2, 2, 2]])
-    assert study.mean_iou([found], [truth]) == pytest.approx((1 / 2 + 1 / 3) / 2)
-
-
-def test_the_study_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study, "CONDITIONS", {"clean": (0.0, 0.0), "30 % lost": (0.0, 0.3)})
-    monkeypatch.setattr(study, "BIASES", (0.0, 0.4))
-    small = partial(make_scene, n_views=9, width=64, height=48, supersampling=1, n_points=2000)
-    monkeypatch.setattr(study, "make_scene", small)
-    words = ["segment/masks", "--iterations", "40", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert measure_claim(words) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| clean"))
-    assert float(line.split("|")[2].split()[0]) > 0.2

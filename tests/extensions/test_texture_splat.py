@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims import texture_splat as study
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
@@ -368,31 +367,3 @@ def test_a_float32_model_stays_float32(rng):
     assert output.image.dtype == np.float32
     v = TEXTURED.render_vjp(tape, np.ones_like(output.image))
     assert all(getattr(v.gaussians, name).dtype == np.float32 for name in (*CHANNELS, "quats", "means"))
-
-
-# --- the study ---
-
-
-def test_the_wall_of_the_study(monkeypatch):
-    """Bricks slope outward at their edges; mortar is flat; maps of the truth have no error; floats do not exceed."""
-    rng = np.random.default_rng(0)
-    wall = study.make_wall(rng)._replace(shifts=np.zeros(16))
-    points = np.array([[0.2, 0.08], [0.395, 0.08], [0.0101, 0.08], [0.39 - 0.03, 0.08]])
-    albedo, normals = study.look_up(wall, points)
-    assert_allclose(albedo[[0, 2]], wall.bricks[[0, 0], [0, 0]])
-    assert_allclose(albedo[1], wall.mortar)
-    assert_allclose(normals[:2], [[0, 0, 1], [0, 0, 1]], atol=1e-12)
-    assert normals[2, 0] == pytest.approx(-0.8 / np.hypot(1, 0.8), rel=0.01)
-    assert normals[3, 0] == pytest.approx(0.4 / np.hypot(1, 0.4), rel=1e-9)
-    monkeypatch.setattr(study, "WIDTH", 32)
-    monkeypatch.setattr(study, "HEIGHT", 24)
-    maps = [study.trace(camera, wall) for camera in study.cameras(rng, 2)]
-    with np.errstate(divide="ignore"):
-        exact = study.compare(maps, tuple(m.materials[:, :, :3] for m in maps), tuple(m.normals for m in maps))
-    assert exact["albedo_psnr"] == np.inf and exact["angle"] < 1e-5
-    for arm, size, population in study.arms(rng):
-        if arm != study.TEXTURES:
-            degree = 3 if arm == study.MORE else 0
-            coarse = next(p for a, t, p in study.arms(np.random.default_rng(0)) if (a, t) == (study.TEXTURES, size))
-            floats, most = (len(p.means) * study.floats_of(p, degree) for p in (population, coarse))
-            assert 0.8 * most < floats <= most

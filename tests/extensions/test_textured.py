@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit import read_scene
-from data_tools.claims.textured import colors_across
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.app.cli import main
@@ -67,13 +65,6 @@ def test_they_enter_the_ellipsoid_where_the_quadratic_says(mean):
     if is_missed.any():  # n points to the nearest point, raised towards the camera by the blunt limb
         cosines = np.sum(n * nearest, axis=1) / np.linalg.norm(nearest, axis=1)
         assert cosines[is_missed].min() >= np.cos(np.arctan(LIMB)) - CLOSED_FORM
-
-
-def test_a_texture_does_not_jump_at_the_limb():
-    """Rays ten times closer differ ten times less; a texture that ends at the limb jumps as much as before."""
-    coarse, fine = (np.abs(np.diff(colors_across(step)[0])).max() for step in (0.01, 0.001))
-    assert 0 < fine < 0.15 * coarse
-    assert np.abs(np.diff(colors_across(0.001)[1])).max() > 0.1
 
 
 @pytest.mark.parametrize("reach", [0.2, 0.9, 3.0], ids=["round", "with limb", "beyond"])
@@ -248,16 +239,3 @@ def exit_code(command):
         return main(command)
     except SystemExit as refused:
         return refused.code
-
-
-def test_the_studies(scene_folder, run_folder, tmp_path, capsys):
-    out, ply = tmp_path / "study", str(run_folder / "point_cloud.ply")
-    options = ["--ply", ply, "--fine-tune", "3", "--out", str(out)]
-    assert measure_claim(["textured/counts", str(scene_folder), *options]) == 0
-    (rows,) = json.loads((out / "result.json").read_text())["runs"]
-    assert [row["form"] for row in rows].count("textures for view") == 4
-    fewer = [row["n_floats"] for row in rows if row["kept"] == "as many floats"]
-    assert len(fewer) == 2 and max(fewer) <= rows[0]["n_floats"]
-    assert (out / "figure.png").stat().st_size > 10_000 and "| as many floats" in capsys.readouterr().out
-    assert measure_claim(["textured/limb"]) == 0
-    assert "nearest point beyond" in capsys.readouterr().out

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.vdgs import floats as floats_study
-from data_tools.claims.vdgs import pane as study
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -70,10 +68,6 @@ def test_opacities_by_hand():
     assert_allclose(v[[0, 2, 4]], [0, 1, 0], rtol=CLOSED_FORM)
     assert_array_equal(v_y[[0, 2, 4]], 0)
     assert_allclose(v_y[1], 0.4 / (0.2 * 0.8), rtol=CLOSED_FORM)
-
-
-def test_schlick_by_hand():
-    assert_allclose(study.schlick(np.array([1, 0.5, 0.0]), 0.04), [0.04, 0.07, 1.0], rtol=CLOSED_FORM)
 
 
 def test_a_mode_says_how_many_outputs_there_are():
@@ -215,7 +209,7 @@ def test_cells_from_16_to_128():
     assert levels_of(np.zeros((4, 2**12, 2))).resolutions == (16, 32, 64, 128)
 
 
-# Runs and studies
+# Runs
 
 
 @pytest.fixture(scope="module")
@@ -253,22 +247,3 @@ def test_a_baked_view_is_that_view(run_folder, tmp_path, capfd):
     ):
         assert main(["vdgs", "bake", *arguments, "--out", str(tmp_path / "no.ply")]) == 2
         assert expected in capfd.readouterr().err and not (tmp_path / "no.ply").exists()
-
-
-def test_the_pane(tmp_path):
-    arguments = ["vdgs/pane", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "pane")]
-    assert measure_claim(arguments) == 0
-    result = json.loads((tmp_path / "pane" / "result.json").read_text())
-    assert [record["arm"] for record in result["records"]] == [study.HARMONICS, study.TIMES, study.PLUS]
-    truth = study.make_pane(np.random.default_rng(0))
-    front = study.make_pane_scene(truth).train_views[23].camera
-    assert_allclose(study.true_opacities(truth, front)[12], study.F0, atol=0.01)
-
-
-def test_equal_floats(monkeypatch, scene):
-    monkeypatch.setattr("minisplat_ref.extensions.vdgs.method.N_ROWS", 16)
-    recipe = floats_study.arms(3)["colors_plus"]
-    assert floats_study.n_shared(scene, recipe) == 4 * 16 * 2 + 11 * 32 + 32 + 32 * 48 + 48 + 4
-    ours, theirs = (floats_study.measure(scene, 3, 50, arm, 0) for arm in ("colors_plus", floats_study.HARMONICS))
-    assert theirs["floats"] == 50 * 59 and 0 <= theirs["floats"] - ours["floats"] < 59
-    assert ours["gaussians"] == 14

@@ -1,4 +1,4 @@
-"""Holograms from the command line: files and images, depths, bad input, and the study."""
+"""Holograms from the command line: files and images, depths, and bad input."""
 
 import json
 import re
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from data_tools.claims.__main__ import main as measure_claim
 from minisplat_ref.app.cli import main
 from minisplat_ref.extensions.wave import hologram_file
 from minisplat_ref.io import viewpoints
@@ -182,30 +181,3 @@ def test_a_file_that_is_no_hologram(hologram, run, tmp_path, capsys):
     line = line_of(["wave", "focus", hologram, "--depth", 0.05, "--out", tmp_path / "x.png"], capsys)
     assert "where light wraps around: the scene is between" in line
     assert not (tmp_path / "x.png").exists()
-
-
-# --- the study ---
-
-
-def test_the_study_measures_its_claims(tmp_path, capsys):
-    assert measure_claim(["wave/claims", "--gaussians", "4", "--out", str(tmp_path / "study")]) == 0
-    result = json.loads((tmp_path / "study" / "result.json").read_text())
-    cost, edge = result["cost"], result["edge"]
-    assert (
-        cost["point cloud"]["waves"] > 10 * cost["exact, whole grid"]["waves"] > 100 * cost["exact, windows"]["waves"]
-    )
-    assert all(found["shadow"] < 0.35 * found["light"] for found in edge.values())
-    assert read_image(tmp_path / "study" / "figure.png").std() > 1
-    assert "brightest planes of Gaussians at: +4.0 mm in +4.0" in capsys.readouterr().out
-
-
-def test_a_trained_scene_is_best_where_it_is_in_focus(run, tmp_path, capsys):
-    ply, out = run / "point_cloud.ply", tmp_path / "study"
-    assert measure_claim(["wave/scene", str(ply), "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
-    thirds = result["thirds"]
-    assert thirds["near"]["depth"] < thirds["middle"]["depth"] < thirds["far"]["depth"]
-    assert thirds["near"]["best focus"] < thirds["far"]["best focus"]
-    assert thirds["near"]["focused nearest"] > thirds["near"]["focused farthest"] + 1  # dB
-    assert result["psnr"]["in one plane"] > 20  # surfels have another low-pass
-    assert read_image(out / "figure.png").std() > 1

@@ -1,7 +1,6 @@
-"""The studies of satellites, and what they rest on: cameras of the boxes, shears and consistency by hand, each arm."""
+"""Satellites: boxes and surface models by hand, measures of the truth, each arm, and small runs of both claims."""
 
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,70 +9,14 @@ from numpy.testing import assert_allclose
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.satellite import boxes
 from data_tools.claims.satellite import measures as claims
-from minisplat_ref.constants import GSPLAT_MAIN
+from data_tools.claims.satellite.measures import perspective_residual
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite import affine_fit
-from minisplat_ref.extensions.satellite.losses import shear_of, view_consistency
-from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY
 from minisplat_ref.extensions.satellite.surface_model import surface_model
-from minisplat_ref.rendering import Request
 from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.losses import Rendered
-from minisplat_ref.types import Model, view_from
+from minisplat_ref.types import Model
 from scenes import as_dtype
 from tolerances import CLOSED_FORM
-
-# --- cameras ---
-
-
-def test_what_is_high_is_seen_beside():
-    """By a tilt of (0.4, -0.3), 10 m move by 4 m to the west in the image and, as north is up, by 3 m to the north."""
-    camera = boxes._camera(np.array([0.4, -0.3]), 96, 96.0, None)  # pixels of a metre
-
-    def seen(x, y, z):
-        return camera.cam_from_world_R @ (np.array([x, y, z]) / boxes.SCALE) + camera.cam_from_world_t
-
-    assert_allclose(seen(0, 0, 0), [48, 48, 0], atol=CLOSED_FORM)
-    assert_allclose(seen(7, 5, 0), [55, 43, 0], rtol=CLOSED_FORM)
-    assert_allclose(seen(7, 5, 10), [51, 40, -10], rtol=CLOSED_FORM)
-
-
-@pytest.mark.parametrize("size", [(1200, 1200), (600, 1200)])
-def test_the_half_diagonal_of_a_photograph_is_one(size, monkeypatch):
-    """With pixels of half a metre, north up: the corners are half of 300 or 600 by 600 m away from the middle."""
-
-    def localise(rpc, pixels, altitudes):
-        return np.column_stack([pixels * [0.5, -0.5] + 1000, altitudes])
-
-    monkeypatch.setattr(affine_fit, "localise", localise)
-    monkeypatch.setattr(affine_fit, "zone_of", lambda longitude: 33)
-    monkeypatch.setattr(affine_fit, "utm_from_degrees", lambda x, y, zone, is_south: np.column_stack([x, y]))
-    frame = affine_fit.frame_of([None], size, (20.0, 80.0))
-    width, height = size
-    assert_allclose(frame.scale, np.hypot(width, height) / 4, rtol=CLOSED_FORM)
-    assert_allclose(frame.origin, [1000 + width / 4, 1000 - height / 4, 20.0], rtol=CLOSED_FORM)
-
-
-# --- consistency of views ---
-
-
-def rendered_of(means, camera, step=1):
-    """Return what a shear needs: the view, the means, the iteration."""
-    model = SimpleNamespace(gaussians=SimpleNamespace(means=means))
-    request = SimpleNamespace(conventions=GSPLAT_MAIN)
-    return SimpleNamespace(view=view_from(camera), request=request, constant=SimpleNamespace(model=model), step=step)
-
-
-def test_a_shear_is_of_the_size_of_the_image():
-    """In coordinates of -1 to 1 it has the deviation that is given: half of the width, and of the height, in pixels."""
-    high = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4 / boxes.SCALE]])  # altitudes span 4 m, 2 m to either side
-    camera = boxes.zenith(40)._replace(height=20)
-    shears = np.array([shear_of(rendered_of(high, camera, step), 0.1) for step in range(2_000)])
-    assert_allclose(shears.std(axis=0), [0.1 * 40 / 2 / 2, 0.1 * 20 / 2 / 2], rtol=0.06)  # 2,000 draws: 1.6 %
-    assert np.abs(shears.mean(axis=0)).max() < 0.1 and abs(np.corrcoef(shears.T)[0, 1]) < 0.1
-    twice = np.array([shear_of(rendered_of(2 * high, camera, step), 0.1) for step in range(5)])
-    assert_allclose(twice, shears[:5] / 2, rtol=CLOSED_FORM)
-    assert shear_of(rendered_of(high, camera, 3), 0.1) == shear_of(rendered_of(high, camera, 3), 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -95,46 +38,45 @@ def plateau():
     return Model(g, {RADIOMETRY: np.eye(3, 4)[None], IN_SHADOW: np.full((1, 3), 0.05)}), truth.scene
 
 
-CHANNELS = {"albedo": slice(3, 6), "altitude": slice(6, 7)}
+def terms_of(recipe):
+    return {term.name for term in recipe.losses}
 
 
-def consistency(monkeypatch, plateau, shift, change=lambda image: image):
-    """Return the loss of a view whose image is changed after it was rendered, by a shear that is given."""
-    (model, scene), request = plateau, Request(wants=frozenset(CHANNELS))
-    view = view_from(boxes.zenith(24))
-    output, _ = SATELLITE.render(model, view, request)
-    changed = output._replace(image=change(output.image))
-    monkeypatch.setattr("minisplat_ref.extensions.satellite.losses.shear_of", lambda *_: shift)
-    rendered = Rendered(changed, CHANNELS, view, scene, model, 1, request)
-    return view_consistency(rendered, altitude=0.01, color=0.1, noise=0.0, limit=1.0)[0]
+def rows_of(said):
+    """Return the cells of the table's rows."""
+    rows = [
+        [cell.strip() for cell in line.strip("| ").split("|")] for line in said.splitlines() if line.startswith("|")
+    ]
+    return rows[2:]
 
 
-@pytest.mark.parametrize("shift", [(0.3, 0.0), (0.0, 0.3), (0.25, -0.35)])
-def test_views_of_a_plateau_agree(plateau, shift, monkeypatch):
-    """A pixel is found where the shear has moved it; two pixels beside, the loss is ten times as large."""
-    right = consistency(monkeypatch, plateau, shift)
-    wrong = consistency(monkeypatch, plateau, shift, lambda image: np.roll(image, 2, axis=(0, 1)))
-    assert 0 < 10 * right < wrong
+def test_boxes_truth():
+    """Heights are those of the boxes, walls are seen at a slant, and a shadow has the length that the sun says."""
+    box = boxes.Boxes(np.array([[-10.0, -10, 0]]), np.array([[10.0, 10, 12]]), np.ones((2, 2, 3)))
+    sun = np.array([-1.0, 0.0, 1.0])
+    _, heights, is_shadow = boxes.trace(box, boxes.zenith(96), sun)
+    assert heights[48, 48] == pytest.approx(12) and heights[48, 60] == pytest.approx(0)
+    dark = np.flatnonzero(is_shadow[48])
+    assert (dark[0], dark[-1]) == (58, 69)  # pixels of a metre: x from 10 to 22 m
 
 
-@pytest.mark.parametrize(
-    ("change", "value"),
-    [
-        ([0, 0, 0, 0.5], 0.01 * 0.5),
-        ([0.2, 0.2, 0.2, 0], 0.1 * 0.2),
-        ([0.3, 0, 0, 0], 0.1 * 0.1),
-        ([0.2, 0.2, 0.2, 1.5], 0.0),  # something hides it
-    ],
-)
-def test_weights_of_consistency_by_hand(plateau, change, value, monkeypatch):
-    """Without a shear, views differ by what is added: altitudes weigh 0.01, albedos 0.1 in the mean of the channels."""
-    added = np.array([0, 0, 0, *change])
-    assert consistency(monkeypatch, plateau, (0.0, 0.0), lambda image: image + added) == pytest.approx(
-        value, abs=CLOSED_FORM
-    )
+def test_residuals_grow_as_the_distance_shrinks():
+    """Ten times nearer, ten times worse; 11.8 pixels from 5 km, and three times that at a slant."""
+    near, far = (perspective_residual(distance, 0.0) for distance in (5e3, 50e3))
+    assert near == pytest.approx(10 * far, rel=0.02) and near == pytest.approx(11.8, abs=0.1)
+    assert perspective_residual(5e3, 25.0) > 2 * near
 
 
-# --- surface models ---
+def test_what_is_high_is_seen_beside():
+    """By a tilt of (0.4, -0.3), 10 m move by 4 m to the west in the image and, as north is up, by 3 m to the north."""
+    camera = boxes._camera(np.array([0.4, -0.3]), 96, 96.0, None)  # pixels of a metre
+
+    def seen(x, y, z):
+        return camera.cam_from_world_R @ (np.array([x, y, z]) / boxes.SCALE) + camera.cam_from_world_t
+
+    assert_allclose(seen(0, 0, 0), [48, 48, 0], atol=CLOSED_FORM)
+    assert_allclose(seen(7, 5, 0), [55, 43, 0], rtol=CLOSED_FORM)
+    assert_allclose(seen(7, 5, 10), [51, 40, -10], rtol=CLOSED_FORM)
 
 
 def test_a_tower_stands_in_its_cells(plateau):
@@ -150,13 +92,6 @@ def test_a_tower_stands_in_its_cells(plateau):
     assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [8.4, 27], atol=0.5)
     wide = surface_model(higher, (24, 36), boxes.SCALE, half=4.0)  # there are Gaussians up to 2 units away
     assert np.isnan(wide[:4]).all() and np.isnan(wide[:, -6:]).all() and wide[14, 16] == pytest.approx(6, abs=0.1)
-
-
-# --- the studies ---
-
-
-def terms_of(recipe):
-    return {term.name for term in recipe.losses}
 
 
 def test_an_arm_lacks_what_its_name_says():
@@ -196,7 +131,7 @@ def test_the_truth_measures_as_it_should(monkeypatch):
     assert gains == pytest.approx(0.1 / np.sqrt(5))  # one of five is off, in every entry
 
 
-def test_the_study_of_boxes_runs(tmp_path, monkeypatch, capsys):
+def test_the_claim_of_boxes_runs(tmp_path, monkeypatch, capsys):
     for module, name, value in ((claims, "SIZE", 16), (claims, "N_POINTS", 60)):
         monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(claims, "make_scene", partial(boxes.make_scene, size=16))
@@ -215,18 +150,10 @@ def test_the_study_of_boxes_runs(tmp_path, monkeypatch, capsys):
     assert len(shown) == 2 and shown[1].ravel().tolist() == [0.5] * 12  # of 24 m
 
 
-def test_the_study_of_distances_runs(tmp_path, capsys):
+def test_the_claim_of_distances_runs(tmp_path, capsys):
     assert measure_claim(["satellite/distance", "--out", str(tmp_path / "d")]) == 0
     said = capsys.readouterr().out
     at_nadir = {km: float(value) for km, angle, value in rows_of(said) if angle == "0"}
     by_hand = {km: 353.5 / 0.3 * 50 / (1e3 * float(km)) for km in ("5", "50", "500")}  # as in test_satellite
     assert at_nadir == pytest.approx(by_hand, rel=0.05)
     assert sum(angle == "25" for _, angle, _ in rows_of(said)) == 3
-
-
-def rows_of(said):
-    """Return the cells of the table's rows."""
-    rows = [
-        [cell.strip() for cell in line.strip("| ").split("|")] for line in said.splitlines() if line.startswith("|")
-    ]
-    return rows[2:]

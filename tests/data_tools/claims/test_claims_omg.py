@@ -1,0 +1,63 @@
+"""OMG: files and distinctiveness, on a small run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from compact import short_run
+from data_tools.claims.__main__ import main as measure_claim
+from minisplat_ref import load_ply, load_scene, save_ply
+from minisplat_ref.extensions.omg import file as omg
+from minisplat_ref.extensions.omg import trained_file
+from minisplat_ref.extensions.omg.pack import read_training
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.strategy.ops import take
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.types import Gaussians
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Return a scene, and a run of the recipe omg on it."""
+    run = short_run(tmp_path_factory.mktemp("omg"), "omg", "--set", "distinct_mass=0.9")
+    return run.parent / "nook", run
+
+
+def test_claim_of_files(folders, tmp_path, capsys):
+    """Sizes and losses in the table are those of the files."""
+    nook, run = folders
+    checkpoint = run / "checkpoint.npz"
+    command = ["omg/files", str(nook), "--checkpoints", str(checkpoint), "--out", str(tmp_path / "out")]
+    assert measure_claim(command) == 0
+    (record,) = json.loads((tmp_path / "out" / "result.json").read_text())["runs"]
+    rows = {row["file"]: row for row in record["rows"]}
+    assert rows["as trained"]["lost"] == 0 and {".spz 0", ".msz 0", ".omg 4", ".omg of the training"} < set(rows)
+    assert rows[".omg of the training"]["n_bytes"] == len(trained_file.encode(*read_training(checkpoint)))
+    assert rows[".omg 2"]["n_bytes"] == len(omg.encode(load_ply(run / "point_cloud.ply"), 2))
+    assert abs(rows[".msz 0"]["lost"]) < 1e-6 < abs(rows[".omg 4"]["lost"])
+    assert ".omg of the training" in capsys.readouterr().out
+
+
+def test_claim(folders, tmp_path, capsys):
+    nook, run = folders
+    command = ["omg/distinctiveness", str(nook), "--fine-tune", "3", "--seeds", "0", "--ply"]
+    save_ply(tmp_path / "two.ply", take(load_ply(run / "point_cloud.ply"), np.arange(2)))
+    few = [*command, str(tmp_path / "two.ply"), "--out", str(tmp_path / "few")]
+    assert measure_claim(few) == 2  # two Gaussians differ from each other alike: both choices keep the same
+    assert "'with distinctiveness' measured exactly what 'importance' did" in capsys.readouterr().err
+    save_ply(tmp_path / "more.ply", initial_state(load_scene(nook), get_recipe("3dgs"), seed=0).gaussians)
+    more = [*command, str(tmp_path / "more.ply"), "--out", str(tmp_path / "out")]
+    assert measure_claim(more) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    rows = result["runs"][0]
+    assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]
+    counts = [row["n_gaussians"] for row in rows]
+    assert counts == sorted(counts, reverse=True) and counts[1] == counts[2] < counts[0]
+    losses = {field: of_seeds[0] for field, of_seeds in result["losses"].items()}
+    assert set(losses) == set(Gaussians._fields) and all(len(of_levels) == 5 for of_levels in losses.values())
+    assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in images of 32 x 24
+    assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
+    assert "textured half" in capsys.readouterr().out
+    assert measure_claim(more) == 0  # continues: there is nothing left to measure
+    assert json.loads((tmp_path / "out" / "result.json").read_text()) == result

@@ -1,0 +1,118 @@
+"""Satellite: the frame of a photograph, shears, and consistency of views by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from data_tools.claims.satellite import boxes
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.extensions.satellite import affine_fit
+from minisplat_ref.extensions.satellite.losses import shear_of, view_consistency
+from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.losses import Rendered
+from minisplat_ref.types import Model, view_from
+from scenes import as_dtype
+from tolerances import CLOSED_FORM
+
+# --- cameras ---
+
+
+@pytest.mark.parametrize("size", [(1200, 1200), (600, 1200)])
+def test_the_half_diagonal_of_a_photograph_is_one(size, monkeypatch):
+    """With pixels of half a metre, north up: the corners are half of 300 or 600 by 600 m away from the middle."""
+
+    def localise(rpc, pixels, altitudes):
+        return np.column_stack([pixels * [0.5, -0.5] + 1000, altitudes])
+
+    monkeypatch.setattr(affine_fit, "localise", localise)
+    monkeypatch.setattr(affine_fit, "zone_of", lambda longitude: 33)
+    monkeypatch.setattr(affine_fit, "utm_from_degrees", lambda x, y, zone, is_south: np.column_stack([x, y]))
+    frame = affine_fit.frame_of([None], size, (20.0, 80.0))
+    width, height = size
+    assert_allclose(frame.scale, np.hypot(width, height) / 4, rtol=CLOSED_FORM)
+    assert_allclose(frame.origin, [1000 + width / 4, 1000 - height / 4, 20.0], rtol=CLOSED_FORM)
+
+
+# --- consistency of views ---
+
+
+def rendered_of(means, camera, step=1):
+    """Return what a shear needs: the view, the means, the iteration."""
+    model = SimpleNamespace(gaussians=SimpleNamespace(means=means))
+    request = SimpleNamespace(conventions=GSPLAT_MAIN)
+    return SimpleNamespace(view=view_from(camera), request=request, constant=SimpleNamespace(model=model), step=step)
+
+
+def test_a_shear_is_of_the_size_of_the_image():
+    """In coordinates of -1 to 1 it has the deviation that is given: half of the width, and of the height, in pixels."""
+    high = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4 / boxes.SCALE]])  # altitudes span 4 m, 2 m to either side
+    camera = boxes.zenith(40)._replace(height=20)
+    shears = np.array([shear_of(rendered_of(high, camera, step), 0.1) for step in range(2_000)])
+    assert_allclose(shears.std(axis=0), [0.1 * 40 / 2 / 2, 0.1 * 20 / 2 / 2], rtol=0.06)  # 2,000 draws: 1.6 %
+    assert np.abs(shears.mean(axis=0)).max() < 0.1 and abs(np.corrcoef(shears.T)[0, 1]) < 0.1
+    twice = np.array([shear_of(rendered_of(2 * high, camera, step), 0.1) for step in range(5)])
+    assert_allclose(twice, shears[:5] / 2, rtol=CLOSED_FORM)
+    assert shear_of(rendered_of(high, camera, 3), 0.1) == shear_of(rendered_of(high, camera, 3), 0.1)
+
+
+@pytest.fixture(scope="module")
+def plateau():
+    """An opaque, textured plane at 6 m of altitude, so that a shear moves what is seen, and changes nothing of it."""
+    truth = boxes.make_scene(0, n_points=4, size=16)
+    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
+    places = np.stack(np.meshgrid(*[np.linspace(-2, 2, 61)] * 2), axis=-1).reshape(-1, 2)
+    n = len(places)
+    waves = np.sin(3 * places[:, :1] + [0, 1, 2]) + np.cos(4 * places[:, 1:] + [0, 1, 2])
+    g = as_dtype(state.gaussians, np.float64)._replace(
+        means=np.column_stack([places, np.full(n, 6 / boxes.SCALE)]),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        log_scales=np.log(np.tile([0.05, 0.05, 1e-4], (n, 1))),
+        opacity_logits=np.full(n, 6.0),
+        sh_dc=0.3 * waves,
+        sh_rest=np.zeros((n, 0, 3)),
+    )
+    return Model(g, {RADIOMETRY: np.eye(3, 4)[None], IN_SHADOW: np.full((1, 3), 0.05)}), truth.scene
+
+
+CHANNELS = {"albedo": slice(3, 6), "altitude": slice(6, 7)}
+
+
+def consistency(monkeypatch, plateau, shift, change=lambda image: image):
+    """Return the loss of a view whose image is changed after it was rendered, by a shear that is given."""
+    (model, scene), request = plateau, Request(wants=frozenset(CHANNELS))
+    view = view_from(boxes.zenith(24))
+    output, _ = SATELLITE.render(model, view, request)
+    changed = output._replace(image=change(output.image))
+    monkeypatch.setattr("minisplat_ref.extensions.satellite.losses.shear_of", lambda *_: shift)
+    rendered = Rendered(changed, CHANNELS, view, scene, model, 1, request)
+    return view_consistency(rendered, altitude=0.01, color=0.1, noise=0.0, limit=1.0)[0]
+
+
+@pytest.mark.parametrize("shift", [(0.3, 0.0), (0.0, 0.3), (0.25, -0.35)])
+def test_views_of_a_plateau_agree(plateau, shift, monkeypatch):
+    """A pixel is found where the shear has moved it; two pixels beside, the loss is ten times as large."""
+    right = consistency(monkeypatch, plateau, shift)
+    wrong = consistency(monkeypatch, plateau, shift, lambda image: np.roll(image, 2, axis=(0, 1)))
+    assert 0 < 10 * right < wrong
+
+
+@pytest.mark.parametrize(
+    ("change", "value"),
+    [
+        ([0, 0, 0, 0.5], 0.01 * 0.5),
+        ([0.2, 0.2, 0.2, 0], 0.1 * 0.2),
+        ([0.3, 0, 0, 0], 0.1 * 0.1),
+        ([0.2, 0.2, 0.2, 1.5], 0.0),  # something hides it
+    ],
+)
+def test_weights_of_consistency_by_hand(plateau, change, value, monkeypatch):
+    """Without a shear, views differ by what is added: altitudes weigh 0.01, albedos 0.1 in the mean of the channels."""
+    added = np.array([0, 0, 0, *change])
+    assert consistency(monkeypatch, plateau, (0.0, 0.0), lambda image: image + added) == pytest.approx(
+        value, abs=CLOSED_FORM
+    )
