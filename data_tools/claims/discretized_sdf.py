@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, seeds
-from data_tools.claims.kit.figures import show, with_deviation
+from data_tools.claims.kit.figures import show, subplots, with_deviation
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.discretized_sdf.losses import projection
 from minisplat_ref.extensions.discretized_sdf.population import WIDTH, SDFSurfels, facing, with_distances
@@ -47,6 +48,12 @@ ARMS = ("by distance, gamma by the median", "by distance, first gamma", "as at t
 N_POINTS, NOISE = 400, 0.03  # where the training of the glossy sphere starts
 ROUGHNESS = 0.3
 RECIPES = ("discretized-sdf", "reflective")
+RELIT = (
+    ("RMS error of albedo", spread("albedo_error", 3)),
+    ("relit (dB)", spread("relit_psnr", 1)),
+    ("as trained (dB)", spread("psnr", 1)),
+    ("surfels", spread("surfels", 0)),
+)
 
 
 class Truth(NamedTuple):
@@ -209,20 +216,11 @@ def run_relight(args: argparse.Namespace) -> kit.Report:
             measured, shown[name] = compare(model, render, truths)
             records.append({"recipe": name, "seed": seed, "surfels": len(model.gaussians.means), **measured})
     truth_image = photograph(truths[0], _light(1))
-    keys = {"albedo_error": 3, "relit_psnr": 1, "psnr": 1, "surfels": 0}
-    rows = [
-        [
-            name,
-            *(with_deviation([r[key] for r in records if r["recipe"] == name], digits) for key, digits in keys.items()),
-        ]
-        for name in RECIPES
-    ]
-    table = markdown_table(["recipe", "RMS error of albedo", "relit (dB)", "as trained (dB)", "surfels"], rows)
-    figure = Figure(figsize=(9, 2.6), layout="constrained")
-    axes = figure.subplots(1, 3)
-    for ax, (name, image) in zip(axes, {"truth, relit": truth_image, **shown}.items(), strict=True):
-        show(ax, np.clip(image, 0, 1), name)
-    return kit.Report({**kit.settings_of(args, "iterations", "seeds"), "records": records}, figure, table)
+    text = table(records, {"recipe": "recipe"}, RELIT)
+    figure, panels = subplots((9, 2.6), 1, 3)
+    for axes, (name, image) in zip(panels, {"truth, relit": truth_image, **shown}.items(), strict=True):
+        show(axes, np.clip(image, 0, 1), name)
+    return kit.Report({**kit.settings_of(args, "iterations", "seeds"), "records": records}, figure, text)
 
 
 def environment(which: int) -> Floats:

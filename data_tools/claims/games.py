@@ -11,17 +11,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, argument, declare, iterations, seeds
-from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
+from data_tools.claims.kit.figures import bars, group
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.games.method import GAMES, on_faces
 from minisplat_ref.interface.palette import BLUE, GREY
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.fusion.extraction import extract
 from minisplat_ref.mechanisms.fusion.kernels import fuse
 from minisplat_ref.mechanisms.fusion.volume import DepthMap, Grid, empty_volume
@@ -39,6 +38,12 @@ VOXEL = 0.1  # of the meshes, world units, metres of these scenes: faces are hal
 ARMS = (("exact mesh", 1), ("exact mesh", 3), ("fused mesh", 1))  # with the number of Gaussians on each face
 AREA_MIN = 1e-4  # of a triangle that is kept, of half a voxel's face
 OPACITY_MIN = 0.1  # of the Gaussians whose centres are measured
+COLUMNS = (
+    ("count", spread("n_gaussians", 0)),
+    ("test PSNR (dB)", spread("psnr", 2)),
+    ("centres off the surface (mm)", spread("distance", 1, 1000)),
+)
+BARS = {"psnr": "PSNR of test views (dB)", "distance": "Centres off the surface (the scene's unit)"}
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -60,11 +65,10 @@ def run(args: argparse.Namespace) -> kit.Report:
                 arm = f"{name}, {per_face} for each face, {'on it' if recipe.name == GAMES.name else 'free'}"
                 records.append({"arm": arm, "seed": seed, **outcome(made, tree, trained, recipe)})
     description = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations", "seeds"), "voxel": VOXEL}
-    heading = ["Gaussians", "count", "test PSNR (dB)", "centres off the surface (mm)"]
-    arms = list(dict.fromkeys(record["arm"] for record in records))
     text = f"{kit.title(description)}; {len(exact.faces):,} faces in the exact mesh\n\n"
-    text += markdown_table(heading, [to_line(arm, records) for arm in arms])
-    return kit.Report({**description, "records": records}, draw(records, arms), text)
+    text += table(records, {"arm": "Gaussians"}, COLUMNS)
+    colors = [BLUE if arm.endswith("on it") else GREY for arm in group(records, "arm")]
+    return kit.Report({**description, "records": records}, bars(records, BARS, (9, 3.2), colors), text)
 
 
 def unbound(iterations: int) -> Recipe:
@@ -120,31 +124,6 @@ def outcome(made: SyntheticScene, tree: cKDTree, trained: Any, recipe: Recipe) -
         "psnr": evaluate(trained, made.scene.test_views, settings).psnr,
         "distance": float(np.median(tree.query(means)[0])),
     }
-
-
-def to_line(arm: str, records: list[dict[str, Any]]) -> list[str]:
-    """Return a line of the table: means and deviations over the seeds."""
-    own = [record for record in records if record["arm"] == arm]
-    count, psnr = (with_deviation([r[key] for r in own], digits) for key, digits in (("n_gaussians", 0), ("psnr", 2)))
-    return [arm, count, psnr, with_deviation([1000 * r["distance"] for r in own], 1)]
-
-
-def draw(records: list[dict[str, Any]], arms: list[str]) -> Figure:
-    """Draw PSNR and distance of each arm."""
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    colors = [BLUE if arm.endswith("on it") else GREY for arm in arms]
-    for axes, key, title in (
-        (left, "psnr", "PSNR of test views (dB)"),
-        (right, "distance", "Centres off the surface (the scene's unit)"),
-    ):
-        values = [mean_and_deviation([r[key] for r in records if r["arm"] == arm]) for arm in arms]
-        means, deviations = np.transpose(values)
-        axes.barh(arms, means, xerr=deviations, color=colors)
-        axes.set_title(title)
-    left.set_xlim(left=min(r["psnr"] for r in records) - 1)
-    left.invert_yaxis()
-    return figure
 
 
 CLAIMS = (

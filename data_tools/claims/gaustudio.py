@@ -13,20 +13,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.ndimage import binary_erosion
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import NAMES, RESUMED_OUT, SCENE, SEEDS, argument, declare, downscale, iterations
-from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
+from data_tools.claims.kit.figures import bars
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.gaustudio.losses import sky_opacity
 from minisplat_ref.extensions.gaustudio.modules import all_stages
 from minisplat_ref.extensions.gaustudio.sky_masks import by_color, from_files
-from minisplat_ref.interface.palette import BLUE, GREY
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.recipe_settings import configure, parse_settings
 from minisplat_ref.training.schedule import Recipe
@@ -47,17 +45,17 @@ SKY_ARMS: dict[str, dict[str, str]] = {
 """Settings by arm, as ``train --set`` takes them."""
 PUBLISHED = "as it is"
 SWAPPED = ("initialiser", "representation", "background", "photo_loss", "density")
-MEASURES = {
-    "opacity": 3,
-    "opacity_max": 2,
-    "opacity_scene": 3,
-    "psnr": 2,
-    "psnr_sky": 2,
-    "psnr_scene": 2,
-    "n_gaussians": 0,
-}
+COLUMNS = (
+    ("mean opacity in the sky", spread("opacity", 3)),
+    ("largest", spread("opacity_max", 2)),
+    ("mean elsewhere", spread("opacity_scene", 3)),
+    ("PSNR (dB)", spread("psnr", 2)),
+    ("in the sky", spread("psnr_sky", 2)),
+    ("elsewhere", spread("psnr_scene", 2)),
+    ("Gaussians", spread("n_gaussians", 0)),
+)
+BARS = {"opacity": "Mean opacity of the scene in the sky", "psnr": "PSNR of test views (dB)"}
 """Columns, with their digits."""
-HEADING = ("mean opacity in the sky", "largest", "mean elsewhere", "PSNR (dB)", "in the sky", "elsewhere", "Gaussians")
 
 
 class Subject(NamedTuple):
@@ -103,16 +101,13 @@ def _report(args: argparse.Namespace, arms: Mapping[str, dict[str, str]]) -> kit
         "masks": args.masks,
         "sky_share": float(np.mean([subject.is_sky[view.name].mean() for view in subject.scene.test_views])),
     }
-    jobs = [{"arm": arm, "seed": seed} for seed in args.seeds for arm in arms]
-
-    def measure(arm: str, seed: int) -> Iterable[Mapping[str, Any]]:
-        return [outcome(subject, arms[arm], args.iterations, seed)]
-
-    records = [record for record in kit.resume(args.out, settings, jobs, measure) if record["arm"] in arms]
-    text = f"{kit.title(settings)}; {args.iterations} iterations; {kit.seeds_of(args)}"
-    table = markdown_table(["arm", *HEADING], to_rows(records, arms))
+    jobs = kit.jobs_of(seed=args.seeds, arm=arms)
+    records = kit.resume(args.out, settings, jobs, lambda seed, arm: outcome(subject, arms[arm], args.iterations, seed))
+    text = f"{kit.title(settings)}; {args.iterations} iterations; {kit.seeds_of(args)}\n\n"
+    text += table(records, {"arm": "arm"}, COLUMNS)
     result = {**settings, "seeds": list(args.seeds), "arms": arms, "records": records}
-    return kit.Report(result, draw(records, arms), f"{text}\n\n{table}", kit.arms_of(records, "arm", tuple(MEASURES)))
+    figure = bars(records, BARS, (9, 1 + 0.35 * len(arms)))
+    return kit.Report(result, figure, text, kit.arms_of(records, "arm", ("opacity", "psnr", "n_gaussians")))
 
 
 def read_subject(source: str, downscale: int, masks: str | None) -> Subject:
@@ -180,34 +175,6 @@ def outcome(subject: Subject, settings: Mapping[str, str], iterations: int, seed
 def psnr_of(squares: Floats) -> float | None:
     """Return the PSNR of squared errors, dB; None where there are no pixels."""
     return float(-10 * np.log10(max(float(np.mean(squares)), SQUARE_MIN))) if squares.size else None
-
-
-def to_rows(records: list[dict[str, Any]], arms: Iterable[str]) -> list[list[str]]:
-    """Return the lines of the table: means and deviations over the seeds; ``-`` where no test view shows a sky."""
-    rows = []
-    for arm in arms:
-        cells = []
-        for key, digits in MEASURES.items():
-            values = [record[key] for record in records if record["arm"] == arm and record[key] is not None]
-            cells.append(with_deviation(values, digits) if values else "-")
-        rows.append([arm, *cells])
-    return rows
-
-
-def draw(records: list[dict[str, Any]], arms: Iterable[str]) -> Figure:
-    """Draw the opacity in the sky and the PSNR of each arm."""
-    names = list(arms)
-    figure = Figure(figsize=(9, 1 + 0.35 * len(names)), layout="constrained")
-    titles = {"opacity": "Mean opacity of the scene in the sky", "psnr": "PSNR of test views (dB)"}
-    for axes, (key, title) in zip(figure.subplots(1, 2, sharey=True), titles.items(), strict=True):
-        values = [[r[key] or 0.0 for r in records if r["arm"] == arm] for arm in names]
-        means, deviations = np.transpose([mean_and_deviation(of_seeds) for of_seeds in values])
-        axes.barh(names, means, xerr=deviations, color=[GREY, *[BLUE] * (len(names) - 1)])
-        axes.set_title(title, fontsize=9)
-        if key == "psnr":
-            axes.set_xlim(min(means - deviations) - 0.5, None)
-    figure.axes[0].invert_yaxis()
-    return figure
 
 
 _MASKS = argument("--masks", metavar="DIR", help="masks of the sky, NAME.png each (default: by colour)")

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import NAMES, RESUMED_OUT, SEEDS, SYNTHETIC_SCENE, argument, declare, iterations
-from data_tools.claims.kit.figures import plot_deviations, with_deviation
+from data_tools.claims.kit.figures import plot_curves, subplots
 from data_tools.claims.kit.mesh_distances import OrientedPoints, compare_surfaces, sample_surface
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.app.runs.depth_maps import DepthKind
 from minisplat_ref.app.runs.meshing import Asked, Opened, mesh_run
 from minisplat_ref.app.runs.scoring import Trained
@@ -25,7 +26,6 @@ from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import SERIES
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.viewpoints import scene_viewpoints
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import unproject_depth
@@ -37,7 +37,12 @@ TAU = 0.05  # world units, metres of these scenes
 VOXELS = (0.02, 0.04, 0.08)
 DEPTH_VOXEL = 0.04  # at which the kinds of depth are compared
 N_POINTS = 100_000  # drawn on the mesh, and of the truth
-_SHARES = {"f_score": 3, "normal_error": 1}  # columns of the table that are no lengths, with their digits
+COLUMNS = (
+    *((name, spread(name.lower(), 1, 1000)) for name in ("accuracy", "completeness", "Chamfer")),
+    (f"F ({TAU:g})", spread("f_score", 3)),
+    ("normals (degrees)", spread("normal_error", 1)),
+)
+CURVES = {"chamfer": "Chamfer distance (the scene's unit)", "f_score": f"F-score at {TAU:g}"}
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -46,18 +51,18 @@ def run(args: argparse.Namespace) -> kit.Report:
     truth = true_surface(made)
     recipes = {text: _recipe_of(text, args.iterations) for text in args.recipes}
     settings = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations"), "tau": TAU}
-    jobs = [{"recipe": name, "seed": seed} for seed in args.seeds for name in args.recipes]
+    jobs = kit.jobs_of(seed=args.seeds, recipe=args.recipes)
 
-    def measure(recipe: str, seed: int) -> Iterable[Mapping[str, Any]]:
+    def measure(seed: int, recipe: str) -> Iterable[Mapping[str, Any]]:
         return measure_meshes(train_run(made, recipes[recipe], seed), truth)
 
     records = kit.resume(args.out, settings, jobs, measure)
-    heading = ["recipe", "depth", "voxel", "accuracy", "completeness", "Chamfer", f"F ({TAU:g})", "normals (degrees)"]
-    rows = to_rows(records, args.recipes)
-    text = f"{kit.title(settings)}; {kit.seeds_of(args)}; lengths in thousandths of the scene's unit"
+    by_recipe = sorted(records, key=lambda record: args.recipes.index(record["recipe"]))
+    text = f"{kit.title(settings)}; {kit.seeds_of(args)}; lengths in thousandths of the scene's unit\n\n"
+    text += table(by_recipe, {"recipe": "recipe", "depth": "depth", "voxel": "voxel"}, COLUMNS)
     result = {**settings, "seeds": list(args.seeds), "records": records}
     arms = kit.arms_of(records, "recipe", ("chamfer", "f_score"))
-    return kit.Report(result, draw(records, args.recipes), f"{text}\n\n{markdown_table(heading, rows)}", arms)
+    return kit.Report(result, draw(records, args.recipes), text, arms)
 
 
 def _recipe_of(text: str, iterations: int) -> Recipe:
@@ -115,35 +120,12 @@ def _has(opened: Opened, kind: DepthKind) -> bool:
     return True
 
 
-def to_rows(records: list[dict[str, Any]], recipes: tuple[str, ...]) -> list[list[str]]:
-    """Return the lines of the table: means and deviations over the seeds."""
-    rows = []
-    for recipe in recipes:
-        own = [record for record in records if record["recipe"] == recipe]
-        for depth, voxel in dict.fromkeys((record["depth"], record["voxel"]) for record in own):
-            of_seeds = [record for record in own if (record["depth"], record["voxel"]) == (depth, voxel)]
-            lengths = [
-                with_deviation([1000 * record[key] for record in of_seeds], 1)
-                for key in ("accuracy", "completeness", "chamfer")
-            ]
-            shares = [with_deviation([record[key] for record in of_seeds], d) for key, d in _SHARES.items()]
-            rows.append([recipe, depth, f"{voxel:g}", *lengths, *shares])
-    return rows
-
-
 def draw(records: list[dict[str, Any]], recipes: tuple[str, ...]) -> Figure:
     """Draw Chamfer distance and F-score of median depths over the voxel."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    for axes, key, title in zip(
-        figure.subplots(1, 2),
-        ("chamfer", "f_score"),
-        ("Chamfer distance (the scene's unit)", f"F-score at {TAU:g}"),
-        strict=True,
-    ):
-        for recipe, color in zip(recipes, SERIES, strict=False):
-            own = [r for r in records if (r["recipe"], r["depth"]) == (recipe, DepthKind.MEDIAN.value)]
-            by_voxel = [[r[key] for r in own if r["voxel"] == voxel] for voxel in VOXELS]
-            plot_deviations(axes, VOXELS, by_voxel, color=color, label=recipe)
+    figure, panels = subplots((9, 3.6), 1, 2)
+    medians = [record for record in records if record["depth"] == DepthKind.MEDIAN.value]
+    for axes, (measure, title) in zip(panels, CURVES.items(), strict=True):
+        plot_curves(axes, medians, "voxel", measure, dict(zip(recipes, SERIES, strict=False)), key="recipe")
         axes.set(title=title, xlabel="voxel (the scene's unit)")
     axes.legend()
     return figure

@@ -7,6 +7,7 @@ the mean of the objects.
 """
 
 import argparse
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,15 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, seeds
-from data_tools.claims.kit.figures import plot_deviations, with_deviation
+from data_tools.claims.kit.figures import plot_curves, subplots
 from data_tools.claims.kit.objects import OBJECTS, mean_iou, object_ids
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.segment.assignment import labels
 from minisplat_ref.extensions.segment.maps import label_map
 from minisplat_ref.extensions.segment.votes import count_votes
 from minisplat_ref.interface.palette import SERIES
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.types import Gaussians, Ints
 
@@ -47,12 +48,9 @@ def run(args: argparse.Namespace) -> kit.Report:
         state = kit.train_with_progress(made.scene, find_recipe("3dgs-accel", args.iterations), seed)
         records += [{"seed": seed, **record} for record in measure(made, state.gaussians, seed)]
     description = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations", "seeds")}
-    heading = ["masks", *(f"gamma {bias:g}" for bias in BIASES)]
     text = f"{kit.title(description)}; mean IoU of {len(OBJECTS)} objects at held-out views\n\n"
-    rows = [[name, *(with_deviation(_of(records, name, bias), 3) for bias in BIASES)] for name in CONDITIONS]
-    return kit.Report(
-        {**description, "biases": BIASES, "records": records}, draw(records), text + markdown_table(heading, rows)
-    )
+    text += table(records, {"masks": "masks"}, [(f"gamma {bias:g}", spread(_at(bias), 3)) for bias in BIASES])
+    return kit.Report({**description, "biases": BIASES, "records": records}, draw(records), text)
 
 
 def measure(made: SyntheticScene, gaussians: Gaussians, seed: int) -> list[dict[str, Any]]:
@@ -95,16 +93,14 @@ def shift(mask: Ints, y: int, x: int) -> Ints:
     return moved
 
 
-def _of(records: list[dict[str, Any]], masks: str, bias: float) -> list[float]:
-    return [r["iou"] for r in records if r["masks"] == masks and r["bias"] == bias]
+def _at(bias: float) -> Callable[[dict[str, Any]], float | None]:
+    return lambda record: record["iou"] if record["bias"] == bias else None
 
 
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Draw the mean IoU over the bias for every kind of masks."""
-    figure = Figure(figsize=(6.5, 3.6), layout="constrained")
-    axes = figure.subplots()
-    for name, color in zip(CONDITIONS, SERIES, strict=False):
-        plot_deviations(axes, BIASES, [_of(records, name, bias) for bias in BIASES], color=color, label=name)
+    figure, axes = subplots((6.5, 3.6))
+    plot_curves(axes, records, "bias", "iou", dict(zip(CONDITIONS, SERIES, strict=False)), key="masks")
     axes.set(title="Labels at held-out views", xlabel="bias to the background", ylabel="mean IoU")
     axes.legend()
     return figure

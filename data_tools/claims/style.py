@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import RESUMED_OUT, declare, iterations, number, seeds
-from data_tools.claims.kit.figures import show, with_deviation
+from data_tools.claims.kit.figures import show, subplots
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.style.styling import Plan, stylise
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
 from minisplat_ref.reference.pinhole import project_into_image, unproject_depth
 from minisplat_ref.rendering import RenderSettings
@@ -29,13 +29,13 @@ SIDE = 96  # pixels of a swatch
 ARMS = {"split": True, "not split": False}
 N_DIRECTIONS, N_QUANTILES = 64, 200
 DEPTH_TOLERANCE = 0.01  # relative, within which two views show the same point
-MEASURES = {
-    "distance_before": ("distance of features, before", 4),
-    "distance": ("after", 4),
-    "disagreement_before": ("disagreement of views (levels), before", 2),
-    "disagreement": ("after", 2),
-    "n_gaussians": ("Gaussians", 0),
-}
+COLUMNS = (
+    ("distance of features, before", spread("distance_before", 4)),
+    ("after", spread("distance", 4)),
+    ("disagreement of views (levels), before", spread("disagreement_before", 2)),
+    ("after", spread("disagreement", 2)),
+    ("Gaussians", spread("n_gaussians", 0)),
+)
 
 
 def swatches() -> dict[str, Floats]:
@@ -53,40 +53,26 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train with every seed, style by every pattern, and measure."""
     made = make_scene("room")
     settings = {**kit.describe_scene(made.scene), **kit.settings_of(args, "training", "iterations", "seeds")}
-    jobs = [
-        {"seed": seed, "pattern": pattern, "arm": arm}
-        for seed in range(args.seeds)
-        for pattern in swatches()
-        for arm in ARMS
-    ]
+    jobs = kit.jobs_of(seed=range(args.seeds), pattern=swatches(), arm=ARMS)
 
     @functools.cache
     def trained(seed: int) -> Gaussians:
-        gaussians: Gaussians = kit.train_with_progress(
-            made.scene, find_recipe("3dgs-accel", args.training), seed
-        ).gaussians
-        return gaussians
+        recipe = find_recipe("3dgs-accel", args.training)
+        return Gaussians(*kit.train_with_progress(made.scene, recipe, seed).gaussians)
 
-    def measure(seed: int, pattern: str, arm: str) -> list[dict[str, Any]]:
+    def measure(seed: int, pattern: str, arm: str) -> dict[str, Any]:
         plan = Plan(iterations=args.iterations, seed=seed, splits=ARMS[arm])
         image = swatches()[pattern]
         styled = stylise(trained(seed), made.scene, image, plan)
         if seed == 0:
             np.save(args.out / f"{pattern}, {arm}.npy", _picture(made, styled.gaussians))
         before, after = (outcome(made, g, image) for g in (styled.recolored, styled.gaussians))
-        return [{**after, **{f"{name}_before": value for name, value in before.items()}}]
+        return {**after, **{f"{name}_before": value for name, value in before.items()}}
 
     records = kit.resume(args.out, settings, jobs, measure)
     pictures = {f"{p}, {arm}": np.load(args.out / f"{p}, {arm}.npy") for p in swatches() for arm in ARMS}
-    heading = ["pattern, arm", *(label for label, _ in MEASURES.values())]
-    rows = []
-    for pattern in swatches():
-        for arm in ARMS:
-            own = [r for r in records if (r["pattern"], r["arm"]) == (pattern, arm)]
-            rows.append(
-                [f"{pattern}, {arm}", *(with_deviation([r[k] for r in own], d) for k, (_, d) in MEASURES.items())]
-            )
-    text = f"{kit.title(settings)}\n\n{markdown_table(heading, rows)}"
+    named = [{**record, "name": f"{record['pattern']}, {record['arm']}"} for record in records]
+    text = f"{kit.title(settings)}\n\n{table(named, {'name': 'pattern, arm'}, COLUMNS)}"
     return kit.Report({**settings, "records": records}, draw(pictures), text)
 
 
@@ -155,8 +141,8 @@ def _picture(made: SyntheticScene, gaussians: Gaussians) -> Floats:
 
 def draw(pictures: dict[str, Floats]) -> Figure:
     """Draw each swatch, and a held-out view in its style by both arms."""
-    figure = Figure(figsize=(9, 4.6), layout="constrained")
-    for row, (pattern, image) in zip(figure.subplots(2, 3), swatches().items(), strict=True):
+    figure, rows = subplots((9, 4.6), 2, 3)
+    for row, (pattern, image) in zip(rows, swatches().items(), strict=True):
         show(row[0], image, pattern)
         for axes, arm in zip(row[1:], ARMS, strict=True):
             show(axes, pictures[f"{pattern}, {arm}"], arm)

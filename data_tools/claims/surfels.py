@@ -6,18 +6,17 @@ opaque, and the normals of the surface through it with the true ones.
 """
 
 import argparse
+from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, seeds, synthetic_scene
-from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
+from data_tools.claims.kit.figures import bars
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.interface.palette import BLUE, GREY
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.depth import expected_depth
@@ -34,30 +33,31 @@ ARMS: dict[str, dict[str, float]] = {
 }
 """Settings by name; the weights are the released ones."""
 ALPHA_MIN = 0.5
-MEASURES = {"depth_error": 2, "normal_error": 1, "psnr": 2, "n_gaussians": 0}
-"""Columns, with their digits."""
+COLUMNS = (
+    ("median depth error (%)", spread("depth_error", 2)),
+    ("median normal error (degrees)", spread("normal_error", 1)),
+    ("test PSNR (dB)", spread("psnr", 2)),
+    ("number", spread("n_gaussians", 0)),
+)
+BARS = {
+    "depth_error": "Median error of the depth (%)",
+    "normal_error": "Median error of normals (degrees)",
+    "psnr": "PSNR of test views (dB)",
+}
 
 
 def run(args: argparse.Namespace) -> kit.Report:
     """Train every arm with every seed, and measure."""
     made = make_scene(args.scene)
-    records = [
-        {"arm": arm, "seed": seed, **outcome(made, arm, args.iterations, seed)}
-        for arm in kit.with_progress(ARMS, "arms")
-        for seed in range(args.seeds)
-    ]
+    records = kit.measure_arms(ARMS, args.seeds, partial(outcome, made, args.iterations))
     description = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations", "seeds")}
-    rows = [
-        [arm, *(with_deviation([r[key] for r in records if r["arm"] == arm], d) for key, d in MEASURES.items())]
-        for arm in ARMS
-    ]
-    heading = ["arm", "median depth error (%)", "median normal error (degrees)", "test PSNR (dB)", "number"]
-    text = f"{kit.title(description)}; {args.iterations} iterations\n\n{markdown_table(heading, rows)}"
+    text = f"{kit.title(description)}; {args.iterations} iterations\n\n{table(records, {'arm': 'arm'}, COLUMNS)}"
     result = {**description, "settings": ARMS, "records": records}
-    return kit.Report(result, draw(records), text, kit.arms_of(records, "arm", ("psnr", "depth_error")))
+    figure = bars(records, BARS, (10, 3))
+    return kit.Report(result, figure, text, kit.arms_of(records, "arm", ("psnr", "depth_error")))
 
 
-def outcome(made: SyntheticScene, arm: str, iterations: int, seed: int) -> dict[str, Any]:
+def outcome(made: SyntheticScene, iterations: int, arm: str, seed: int) -> dict[str, Any]:
     """Train, and return the errors of depth, normals and image on the test views."""
     recipe = configure(find_recipe(GAUSSIANS if arm == GAUSSIANS else "surfels", iterations), **ARMS[arm])
     state = kit.train_with_progress(made.scene, recipe, seed)
@@ -78,25 +78,6 @@ def outcome(made: SyntheticScene, arm: str, iterations: int, seed: int) -> dict[
         "psnr": evaluate(state.model, made.scene.test_views, settings).psnr,
         "n_gaussians": len(state.gaussians.means),
     }
-
-
-def draw(records: list[dict[str, Any]]) -> Figure:
-    """Draw the errors of depth and normals and the PSNR of each arm."""
-    figure = Figure(figsize=(10, 3), layout="constrained")
-    titles = {
-        "depth_error": "Median error of the depth (%)",
-        "normal_error": "Median error of normals (degrees)",
-        "psnr": "PSNR of test views (dB)",
-    }
-    for axes, (key, title) in zip(figure.subplots(1, 3, sharey=True), titles.items(), strict=True):
-        values = [mean_and_deviation([r[key] for r in records if r["arm"] == arm]) for arm in ARMS]
-        means, deviations = np.transpose(values)
-        axes.barh(list(ARMS), means, xerr=deviations, color=[GREY, *[BLUE] * (len(ARMS) - 1)])
-        axes.set_title(title, fontsize=9)
-        if key == "psnr":
-            axes.set_xlim(min(means - deviations) - 0.5, None)
-    figure.axes[0].invert_yaxis()
-    return figure
 
 
 CLAIMS = (

@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit import claim
-from data_tools.claims.kit.figures import with_deviation
+from data_tools.claims.kit.figures import subplots
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.extensions.textured.reference import frames, meet
 from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
 from minisplat_ref.interface.palette import BLUE, GREY, RED
@@ -35,6 +36,13 @@ PLAIN = "3DGS"
 PAPER, BOTH = "textures for view", "textures and view"
 COLORS = {PLAIN: GREY, PAPER: RED, BOTH: BLUE}
 STEPS = (0.1, 0.01, 0.001)  # px from ray to ray
+COLUMNS = (
+    ("number", mean("n_gaussians")),
+    ("floats", mean("n_floats")),
+    ("test PSNR", spread("psnr", 2)),
+    ("test SSIM", spread("ssim", 4)),
+    ("training PSNR", spread("training_psnr", 2)),
+)
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -49,9 +57,10 @@ def run(args: argparse.Namespace) -> kit.Report:
         "is_frozen": args.frozen,
         "runs": runs,
     }
-    heading = ["Gaussians", "with", "degree", "number", "floats", "test PSNR", "test SSIM", "training PSNR"]
     frozen = ", positions and shapes frozen" if args.frozen else ""
-    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations{frozen}\n\n{markdown_table(heading, to_rows(runs))}"
+    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations{frozen}\n\n"
+    rows = [row for run in runs for row in run]
+    text += table(rows, {"kept": "Gaussians", "form": "with", "degree": "degree"}, COLUMNS)
     arms = {f"{row['form']}, {row['kept']}, degree {row['degree']}": row for rows in runs[:1] for row in rows}
     return kit.Report(result, draw(result), text, {name: row["psnr"] for name, row in arms.items()})
 
@@ -86,24 +95,10 @@ def outcomes(whole: Gaussians, scene: Scene, fine_tuned: Callable[[Any], Any]) -
     return rows
 
 
-def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
-    """Return the lines of the table: means and deviations over the seeds."""
-    lines = []
-    for rows in zip(*runs, strict=True):
-        n, n_floats = (np.mean([row[key] for row in rows]) for key in ("n_gaussians", "n_floats"))
-        measures = [
-            with_deviation([row[key] for row in rows], digits)
-            for key, digits in (("psnr", 2), ("ssim", 4), ("training_psnr", 2))
-        ]
-        first = rows[0]
-        lines.append([first["kept"], first["form"], str(first["degree"]), f"{n:,.0f}", f"{n_floats:,.0f}", *measures])
-    return lines
-
-
 def draw(result: dict[str, Any]) -> Figure:
     """Draw PSNR against the number of floats, for test views and training views."""
-    figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-    for axes, key in zip(figure.subplots(1, 2), ("psnr", "training_psnr"), strict=True):
+    figure, panels = subplots((9.5, 3.6), 1, 2)
+    for axes, key in zip(panels, ("psnr", "training_psnr"), strict=True):
         for form, color in COLORS.items():
             for kept, marker in (("all", "o"), ("as many floats", "s")):
                 rows = [r for run in result["runs"] for r in run if (r["form"], r["kept"]) == (form, kept)]

@@ -17,6 +17,7 @@ features. Rates of both kinds of queries were chosen on a smaller room, by the r
 import argparse
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import set_ticks, summarise, with_deviation
+from data_tools.claims.kit.figures import group, set_ticks, subplots, summarise
 from data_tools.claims.kit.objects import OBJECTS, mean_iou, object_ids
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.cus.bank import feature_error, first_keys, read_vjp
 from minisplat_ref.extensions.cus.decoding import decode
@@ -35,7 +37,6 @@ from minisplat_ref.extensions.cus.method import ANCHORS, CUS, LATENT
 from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, QUERY, Anchors
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import BLUE, RED
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.features.blending import blend_channels, blend_channels_vjp
 from minisplat_ref.mechanisms.networks.networks import COMPILED
 from minisplat_ref.metrics import evaluate
@@ -55,6 +56,13 @@ FIXED_FLOATS = 5  # of an anchor that are equal for all: an opacity and a rotati
 ANCHOR_ARM, OWN = "anchors", "own queries"
 SAMPLES = 2_048  # pixels of an iteration
 OWN_RATES = {"queries": 0.2, KEYS: 1e-2, ADAPTER: 1e-2}  # the best of several, as those of the recipe are
+FEATURES = (
+    ("Gaussians", mean("gaussians")),
+    ("floats of features", mean("floats")),
+    ("error of features", spread("error", 4)),
+    ("mean IoU", spread("iou", 3)),
+)
+IMAGES = (("Gaussians", mean("gaussians")), ("floats in all", mean("all_floats")), ("PSNR dB", spread("psnr", 2)))
 RULE = AdamRule(is_visible_only=False, has_bias_correction=True)
 
 
@@ -226,8 +234,8 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train all arms with every seed."""
     made = make_scene("room", **SIZE)
     settings = {**kit.describe_scene(made.scene), **kit.settings_of(args, "iterations")}
-    jobs = [{"seed": seed} for seed in range(args.seeds)]
-    records = kit.resume(args.out, settings, jobs, lambda seed: measure(made, args.iterations, seed))
+    jobs = kit.jobs_of(seed=range(args.seeds))
+    records = kit.resume(args.out, settings, jobs, partial(measure, made, args.iterations))
     text = f"{kit.title(settings)}; features of {DIMENSION} channels, {args.iterations} iterations"
     return report(records, {**settings, "seeds": args.seeds}, text)
 
@@ -236,35 +244,20 @@ def report(records: list[dict[str, Any]], settings: dict[str, Any], heading: str
     """Return tables and figure of the records of all arms."""
     of_features = [record for record in records if "error" in record]
     of_images = [record for record in records if "psnr" in record]
-    features = _table(of_features, "floats of features", "floats", {"error": 4, "iou": 3})
-    images = _table(of_images, "floats in all", "all_floats", {"psnr": 2})
+    tables = [table(own, {"arm": "arm"}, to) for own, to in ((of_features, FEATURES), (of_images, IMAGES))]
     result = {**settings, "records": records, "summary": summarise(of_features, "arm", ("floats", "error", "iou"))}
     arms = kit.arms_of(of_features, "arm", ("error", "iou"))
-    return kit.Report(result, draw(of_features), f"{heading}\n\n{features}\n\n{images}", arms=arms)
-
-
-def _table(records: list[dict[str, Any]], label: str, floats: str, measures: dict[str, int]) -> str:
-    """Return a row for each arm: Gaussians where they are known, floats, and measures with these digits."""
-    rows = []
-    for name in dict.fromkeys(record["arm"] for record in records):
-        own = [record for record in records if record["arm"] == name]
-        numbers = [f"{np.mean([r[key] for r in own]):,.0f}" if key in own[0] else "" for key in ("gaussians", floats)]
-        rows.append([name, *numbers, *(with_deviation([r[key] for r in own], n) for key, n in measures.items())])
-    names = {"error": "error of features", "iou": "mean IoU", "psnr": "PSNR dB"}
-    return markdown_table(["arm", "Gaussians", label, *(names[key] for key in measures)], rows)
+    return kit.Report(result, draw(of_features), "\n\n".join([heading, *tables]), arms=arms)
 
 
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Plot the error of features and the mean IoU over the floats."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    names = list(dict.fromkeys(record["arm"] for record in records))
-    measures = (("error", "error of features"), ("iou", "mean IoU"))
-    for axes, (key, label) in zip(figure.subplots(1, 2), measures, strict=True):
+    figure, panels = subplots((9, 3.6), 1, 2)
+    arms = group(records, "arm")
+    for axes, (key, label) in zip(panels, {"error": "error of features", "iou": "mean IoU"}.items(), strict=True):
         for start, color in ((ANCHOR_ARM, BLUE), (OWN, RED)):
-            arms = [name for name in names if name.startswith(start)]
-            points = [
-                [np.mean([r[of] for r in records if r["arm"] == name]) for name in arms] for of in ("floats", key)
-            ]
+            shown = [own for name, own in arms.items() if name.startswith(start)]
+            points = [[np.mean([record[of] for record in own]) for own in shown] for of in ("floats", key)]
             axes.plot(*points, "o-", color=color, label=start)
         axes.set(xlabel="floats of the features", ylabel=label, xscale="log")
         ticks = sorted({int(line) for arm in axes.lines for line in arm.get_xdata()})

@@ -8,6 +8,7 @@ start; from few points there are no more anchors to be had like this, and the ar
 import argparse
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +25,24 @@ from data_tools.claims.cus.floats import (
     quality,
     recipe_of,
 )
-from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
+from data_tools.claims.kit.figures import group, mean_and_deviation, subplots
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.cus.growth import THRESHOLD, grow_anchors
 from minisplat_ref.extensions.cus.method import LATENT
 from minisplat_ref.interface.palette import BLUE, GREY, RED
-from minisplat_ref.interface.reporting import markdown_table
-from minisplat_ref.training.recipe_settings import configure
-from minisplat_ref.training.schedule import Recipe, without
+from minisplat_ref.training.schedule import Recipe, configure, without
 
 POINTS = (2_000, 300)  # that trainings begin with; the first is as in cus/floats
 WITHOUT, WITH, SMALLER = "without growing", "with growing", "smaller voxels"
 COLORS = {WITHOUT: GREY, WITH: RED, SMALLER: BLUE}
+COLUMNS = (
+    ("anchors", mean("anchors")),
+    ("floats in all", mean("all_floats")),
+    ("PSNR dB", spread("psnr", 2)),
+    ("error of features", spread("error", 4)),
+    ("mean IoU", spread("iou", 3)),
+)
 SMALLER_VOXEL = 0.4  # about as many anchors from 2,000 points as growing ends with
 
 
@@ -68,43 +75,29 @@ def measure(iterations: int, n_points: int, seed: int) -> list[dict[str, Any]]:
 
 def run(args: argparse.Namespace) -> kit.Report:
     """Train all arms with every seed."""
-    settings = {
-        **kit.describe_scene(make_scene("room", **SIZE).scene),
-        **kit.settings_of(args, "iterations"),
-    }
-    jobs = [{"n_points": n_points, "seed": seed} for n_points in POINTS for seed in range(args.seeds)]
-    records = kit.resume(args.out, settings, jobs, lambda n_points, seed: measure(args.iterations, n_points, seed))
+    settings = {**kit.describe_scene(make_scene("room", **SIZE).scene), **kit.settings_of(args, "iterations")}
+    jobs = kit.jobs_of(n_points=POINTS, seed=range(args.seeds))
+    records = kit.resume(args.out, settings, jobs, partial(measure, args.iterations))
     return report(records, {**settings, "seeds": args.seeds}, f"{kit.title(settings)}; {args.iterations} iterations")
 
 
 def report(records: list[dict[str, Any]], settings: dict[str, Any], heading: str) -> kit.Report:
     """Return table and figure of the records of all arms."""
-    rows = []
-    for name in dict.fromkeys(record["arm"] for record in records):
-        own = [record for record in records if record["arm"] == name]
-        numbers = [f"{np.mean([record[key] for record in own]):,.0f}" for key in ("anchors", "all_floats")]
-        measures = (("psnr", 2), ("error", 4), ("iou", 3))
-        rows.append([name, *numbers, *(with_deviation([r[key] for r in own], n) for key, n in measures)])
-    header = ["arm", "anchors", "floats in all", "PSNR dB", "error of features", "mean IoU"]
-    text = f"{heading}\n\n{markdown_table(header, rows)}"
+    text = f"{heading}\n\n{table(records, {'arm': 'arm'}, COLUMNS)}"
     arms = kit.arms_of(records, "arm", ("anchors", "psnr", "error"))
     return kit.Report({**settings, "records": records}, draw(records), text, arms=arms)
 
 
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Plot PSNR and error of features of all arms over their floats."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    names = list(dict.fromkeys(record["arm"] for record in records))
-    for axes, key, label in zip(
-        figure.subplots(1, 2), ("psnr", "error"), ("PSNR dB", "error of features"), strict=True
-    ):
-        for name in names:
-            own = [record for record in records if record["arm"] == name]
+    figure, panels = subplots((9, 3.6), 1, 2)
+    for axes, (key, label) in zip(panels, {"psnr": "PSNR dB", "error": "error of features"}.items(), strict=True):
+        for name, own in group(records, "arm").items():
             points, arm = name.split(", ")
-            mean, deviation = mean_and_deviation([record[key] for record in own])
+            deviations = mean_and_deviation([record[key] for record in own])
             floats = np.mean([record["all_floats"] for record in own])
             marker = "o" if points == f"{POINTS[0]:,} points" else "s"
-            axes.errorbar(floats, mean, deviation, fmt=marker, color=COLORS[arm], label=name)
+            axes.errorbar(floats, *deviations, fmt=marker, color=COLORS[arm], label=name)
         axes.set(xlabel="floats in all", ylabel=label)
     axes.legend(fontsize=8)
     return figure

@@ -16,15 +16,17 @@ from scipy import ndimage
 
 from data_tools.claims import kit
 from data_tools.claims.cuts import card
-from data_tools.claims.kit.figures import plot_deviations, show, with_deviation
+from data_tools.claims.kit.figures import plot_curves, show
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.palette import BLUE, GREY, RED
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Bools, Floats
 
-NAMES, COLORS = ("no curve", "1 curve", "2 curves"), (GREY, RED, BLUE)  # by the number of curves
+COLORS = {"no curve": GREY, "1 curve": RED, "2 curves": BLUE}
+NAMES = tuple(COLORS)  # by the number of curves
 NUMBERS = ((6, 12, 24, 48), (6, 12, 15, 30), (6, 11, 22))  # Gaussians: 14, 22 and 30 floats each
 N_FLOATS = (14, 22, 30)
+COLUMNS = (("PSNR (dB)", spread("psnr", 1)), ("at the edge", spread("band", 1)), ("elsewhere", spread("elsewhere", 1)))
 EDGE_SHARE = 0.5  # of the largest gradient
 
 
@@ -49,16 +51,10 @@ def run(args: argparse.Namespace) -> kit.Report:
         rows.append({**row, **{key: [measure[key] for measure in measures] for key in measures[0]}})
     place = {"photograph": view.name, "x": corner[0], "y": corner[1]}
     result = {**kit.settings_of(args, "scene", "downscale", "iterations", "seeds"), **place, "rows": rows}
-    heading = ["Gaussians", "number", "floats", "PSNR (dB)", "at the edge", "elsewhere"]
-    table = [[str(row[key]) for key in ("kind", "n_gaussians", "n_floats")] + _measured(row) for row in rows]
     text = f"{view.name}, {card.SIZE} x {card.SIZE} pixels from {corner[0]}, {corner[1]}\n\n"
-    text += markdown_table(heading, table)
+    text += table(rows, {"kind": "Gaussians", "n_gaussians": "number", "n_floats": "floats"}, COLUMNS)
     arms = kit.arms_of([row for row in rows if row["n_gaussians"] == NUMBERS[0][0]], "kind", ("psnr",))
     return kit.Report(result, draw(rows, [("photograph", target.image), *images]), text, arms)
-
-
-def _measured(row: dict[str, Any]) -> list[str]:
-    return [with_deviation(row[key], 1) for key in ("psnr", "band", "elsewhere")]
 
 
 def find_edge(photograph: Floats) -> tuple[card.Target, tuple[int, int]]:
@@ -97,10 +93,7 @@ def draw(rows: list[dict[str, Any]], images: list[tuple[str, Floats]]) -> Figure
     places = figure.add_gridspec(2, 2 * len(images))
     for column, (key, title) in enumerate((("psnr", "whole window"), ("band", "at the edge"))):
         axes = figure.add_subplot(places[0, column * len(images) : (column + 1) * len(images)])
-        for kind, color in zip(NAMES, COLORS, strict=True):
-            of_kind = [row for row in rows if row["kind"] == kind]
-            floats = [row["n_floats"] for row in of_kind]
-            plot_deviations(axes, floats, [row[key] for row in of_kind], color=color, label=kind)
+        plot_curves(axes, rows, "n_floats", key, COLORS, key="kind")
         axes.set(title=title, xlabel="floats", ylabel="PSNR (dB)")
         axes.legend()
     for k, (heading, image) in enumerate(images):

@@ -14,22 +14,36 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.cuts import card
-from data_tools.claims.kit.figures import beside_images, plot_deviations, with_deviation
+from data_tools.claims.kit.figures import beside_images, plot_curves
+from data_tools.claims.kit.tables import Cell, first, spread, table
 from minisplat_ref.interface.palette import GREY, RED
-from minisplat_ref.interface.reporting import markdown_table
 
 NUMBERS = {"plain": (1, 3, 6, 12), "cut": (1, 3, 6)}
 COLORS = {"plain": GREY, "cut": RED}
 N_FLOATS = {"plain": 14, "cut": 22}  # per Gaussian without view-dependent colour
 
 
+def _of_best(measure: str) -> Cell:
+    """Return a cell with a measure of the training that has the highest PSNR."""
+    return first(lambda row: row[measure][int(np.argmax(row["psnr"]))], ".1f")
+
+
+COLUMNS = (
+    ("PSNR", spread("psnr", 1)),
+    ("best", _of_best("psnr")),
+    ("at the edge", _of_best("band")),
+    ("elsewhere", _of_best("elsewhere")),
+    ("10-90 % (px)", _of_best("edge_width")),
+)
+
+
 def run(args: argparse.Namespace) -> kit.Report:
     """Train and measure."""
     rows, images = outcomes(args.iterations, args.seeds)
     result = {**kit.settings_of(args, "iterations", "seeds"), "rows": rows}
-    heading = ["image", "Gaussians", "number", "floats", "PSNR", "best", "at the edge", "elsewhere", "10-90 % (px)"]
     arms = kit.arms_of([row for row in rows if row["n_gaussians"] in NUMBERS["cut"]], "kind", ("psnr",))
-    return kit.Report(result, draw(rows, images), markdown_table(heading, [to_line(row) for row in rows]), arms)
+    keys = {"image": "image", "kind": "Gaussians", "n_gaussians": "number", "n_floats": "floats"}
+    return kit.Report(result, draw(rows, images), table(rows, keys, COLUMNS), arms)
 
 
 def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -46,22 +60,11 @@ def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[
     return rows, images
 
 
-def to_line(row: dict[str, Any]) -> list[str]:
-    """Return a line of the table."""
-    best = int(np.argmax(row["psnr"]))
-    measures = [f"{row[key][best]:.1f}" for key in ("psnr", "band", "elsewhere", "edge_width")]
-    numbers = [str(row["n_gaussians"]), str(row["n_floats"])]
-    return [row["image"], row["kind"], *numbers, with_deviation(row["psnr"], 1), *measures]
-
-
 def draw(rows: list[dict[str, Any]], images: dict[str, Any]) -> Figure:
     """Draw PSNR against the number of floats, and the images."""
     figure = Figure(figsize=(14.0, 5.0), layout="constrained")
     for name, axes in beside_images(figure, images).items():
-        for kind, color in COLORS.items():
-            of_kind = [row for row in rows if (row["image"], row["kind"]) == (name, kind)]
-            numbers = [row["n_floats"] for row in of_kind]
-            plot_deviations(axes, numbers, [row["psnr"] for row in of_kind], color=color, label=kind)
+        plot_curves(axes, [row for row in rows if row["image"] == name], "n_floats", "psnr", COLORS, key="kind")
         axes.set(title=name, xlabel="floats", ylabel="PSNR (dB)")
         axes.legend()
     return figure

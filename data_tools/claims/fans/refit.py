@@ -18,7 +18,8 @@ from data_tools.claims import kit
 from data_tools.claims.fans import measures as claims
 from data_tools.claims.fans import profile
 from data_tools.claims.fans.profile import profile_error
-from data_tools.claims.kit.figures import mean_and_deviation, show, table_of, with_deviation
+from data_tools.claims.kit.figures import mean_and_deviation, show, table_of
+from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.extensions.fans.shapes import FanShape
 from minisplat_ref.extensions.fans.tuning import render_clipped
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
@@ -27,6 +28,14 @@ from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.types import Scene
 
 KNOWN = ((2.5, 0.0), (2.3, 0.2), (2.7, 0.2))  # the best fan of 8 sides, and two that are used
+COLUMNS = (
+    ("reach, rim", first(lambda row: f"{row['reach']:.2f}, {row['rim']:.2f}" if "reach" in row else "")),
+    ("test PSNR", spread("psnr", 2)),
+    ("test SSIM", spread("ssim", 4)),
+    ("training PSNR", spread("training_psnr", 2)),
+    ("triangles", first(lambda row: f"{row['triangles']:,}" if "triangles" in row else "")),
+    ("bytes of the .ply", first(lambda row: f"{row['bytes']:,}" if "bytes" in row else "")),
+)
 RIM_COLORS = {0.0: BLUE, 0.1: OCHRE, 0.2: RED}
 
 
@@ -105,22 +114,10 @@ def render_forms(forms: dict[str, Any], scene: Scene) -> dict[str, Any]:
 
 def tables(runs: list[dict[str, Any]]) -> str:
     """Return what the forms reach, the shapes of the first seed, and the layers."""
-    lines = []
-    for rows in zip(*(run["rows"] for run in runs), strict=True):
-        first = rows[0]
-        measures = [
-            with_deviation([row[key] for row in rows], digits)
-            for key, digits in (("psnr", 2), ("ssim", 4), ("training_psnr", 2))
-        ]
-        fit = f"{first['reach']:.2f}, {first['rim']:.2f}" if "reach" in first else ""
-        size = [f"{first[key]:,}" if key in first else "" for key in ("triangles", "bytes")]
-        lines.append([first["form"], fit, *measures, *size])
-    heading = ["", "reach, rim", "test PSNR", "test SSIM", "training PSNR", "triangles", "bytes of the .ply"]
-    text = markdown_table(heading, lines)
+    text = table([row for run in runs for row in run["rows"]], {"form": ""}, COLUMNS)
     for name, shapes in runs[0]["shapes"].items():
-        lines = [[str(s["n_sides"]), f"{s['reach']:g}", f"{s['rim']:g}", f"{s['psnr']:.2f}"] for s in shapes]
         text += f"\n\n{name} against splats of degree 0, seed 0\n\n"
-        text += markdown_table(["sides", "reach", "rim", "PSNR"], lines)
+        text += table(shapes, {"n_sides": "sides", "reach": "reach", "rim": "rim"}, [("PSNR", first("psnr", ".2f"))])
     for name, (whole, *rows) in runs[0]["layers"].items():
         cells = ", ".join(f"{row['layers']}: {row['rms_levels']:.2g}" for row in rows)
         text += f"\n\n{name}: {whole['mean']:.1f} layers a pixel, at most {whole['most']}"

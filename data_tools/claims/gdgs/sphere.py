@@ -12,10 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import with_deviation
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.extensions.gdgs.method import N_CELLS, N_TOP, on_planes, spacing_of
 from minisplat_ref.extensions.gdgs.reference import Weights, attract, contract, densest, disperse, regions_of
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.oriented.planes import fit_planes
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between, normals_of
 from minisplat_ref.types import Floats, Gaussians
@@ -25,16 +24,19 @@ ONLY_POSITIONS = Weights(1.0, 0.0, 0.0)
 RATE = 0.2  # of the distance to the plane, for each step
 CROWDING_RATE = 0.01  # of the region's side: the longest step by the terms on crowds
 ARMS = ("points", "predictor and planes", "attraction", "attraction and contraction", "attraction and dispersion")
-MEASURES = {"distance": 4, "angle": 1, "spacing": 3}
+COLUMNS = (
+    ("distance to the sphere (RMS)", spread("distance", 4)),
+    ("angle of normals (degrees)", spread("angle", 1)),
+    ("spacing (variation)", spread("spacing", 3)),
+)
 
 
 def run(args: argparse.Namespace) -> str:
     """Return the table."""
     found = [measure(args.steps, seed) for seed in kit.with_progress(range(args.seeds), "seeds")]
-    rows = [[arm, *(with_deviation([f[arm][key] for f in found], d) for key, d in MEASURES.items())] for arm in ARMS]
-    heading = ["Gaussians", "distance to the sphere (RMS)", "angle of normals (degrees)", "spacing (variation)"]
+    records = [{"arm": arm, **measured} for of_seed in found for arm, measured in of_seed.items()]
     text = f"{N_POINTS:,} points of a unit sphere with noise {NOISE:g}; {args.steps} steps; {args.seeds} seeds"
-    return f"{text}\n\n{markdown_table(heading, rows)}"
+    return f"{text}\n\n{table(records, {'arm': 'Gaussians'}, COLUMNS)}"
 
 
 def measure(steps: int, seed: int) -> dict[str, dict[str, float]]:

@@ -12,7 +12,7 @@ import argparse
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from data_tools.claims.kit.claim import FIGURE, RESULT
 from data_tools.claims.kit.figures import STYLE
+from data_tools.claims.kit.records import jobs_of as jobs_of
 from data_tools.claims.kit.records import resume as resume
 from minisplat_ref.datasets.named_scenes import read_scene as read_scene
 from minisplat_ref.errors import InputError
@@ -149,6 +150,15 @@ def arms_of(records: Iterable[Mapping[str, Any]], key: str, measures: Sequence[s
     for record in records:
         arms.setdefault(record[key], []).append([record[measure] for measure in measures])
     return arms
+
+
+def measure_arms(arms: Collection[str], n_seeds: int, measure: Callable[[str, int], Any]) -> list[dict[str, Any]]:
+    """Return the records of all arms with all seeds from 0 on; ``measure`` gets the arm's name and the seed."""
+    return [
+        {"arm": arm, "seed": seed, **measure(arm, seed)}
+        for arm in with_progress(arms, "arms")
+        for seed in range(n_seeds)
+    ]
 
 
 def settings_of(args: argparse.Namespace, *names: str) -> dict[str, Any]:

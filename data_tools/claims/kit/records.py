@@ -5,6 +5,7 @@ or :data:`HAND_OUT` says who carries them out, each in a process of its own, whi
 set: it measures that job, leaves its records in a file, and ends.
 """
 
+import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +21,9 @@ from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import replacing
 
 RUNS = "runs.jsonl"  # what has been measured so far, below the settings
+
+Measured = Mapping[str, Any] | Iterable[Mapping[str, Any]]
+"""One record, or several."""
 
 HandOut = Callable[[Path, Sequence[int]], None]
 """Has jobs carried out, by their numbers, which leave their records in the folder."""
@@ -98,11 +102,11 @@ def resume(
     folder: Path,
     settings: Mapping[str, Any],
     jobs: Sequence[Mapping[str, Any]],
-    measure: Callable[..., Iterable[Mapping[str, Any]]],
+    measure: Callable[..., Measured],
     warm_up: Callable[[list[Mapping[str, Any]]], None] = lambda missing: None,
     nouns: str = "trainings",
 ) -> list[dict[str, Any]]:
-    """Measure the jobs that have no record in the folder, and return all its records.
+    """Measure the jobs that have no record in the folder, and return the records of all jobs, in the folder's order.
 
     Parameters
     ----------
@@ -113,7 +117,7 @@ def resume(
     jobs : sequence of dict
         Keyword arguments of ``measure``, which a record has, too.
     measure : callable
-        Returns the further entries of each record of a job.
+        Returns the further entries of the record of a job, or of each of its records.
     warm_up : callable
         Called with the missing jobs before the first, so that none counts the time of compiling.
     nouns : str
@@ -128,30 +132,38 @@ def resume(
         _measure_one(folder, number, jobs[number], measure, warm_up)
     records = _read_records(folder, settings, nouns)
     records += _take_in(folder, range(len(jobs)), jobs)  # of a call that was interrupted
-    missing = [
-        number for number, job in enumerate(jobs) if not any(job.items() <= record.items() for record in records)
-    ]
+    records = [record for record in records if any(job.items() <= record.items() for job in jobs)]
+    missing = [n for n, job in enumerate(jobs) if not any(job.items() <= record.items() for record in records)]
     if missing and (hand_out := HAND_OUT.get()) is not None:
         hand_out(folder, missing)
         return records + _take_in(folder, missing, jobs)
     warm_up([jobs[number] for number in missing])
     for number in with_progress(missing, nouns):
         job = jobs[number]
-        for measured in measure(**job):
+        for measured in _each(measure(**job)):
             records.append({**job, **measured})
             _append(folder, records[-1:])
     return records
+
+
+def jobs_of(**choices: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return a job for each combination of choices, which are named in the order of loops, the outermost first."""
+    return [dict(zip(choices, chosen, strict=True)) for chosen in itertools.product(*choices.values())]
+
+
+def _each(measured: Measured) -> Iterable[Mapping[str, Any]]:
+    return [measured] if isinstance(measured, Mapping) else measured
 
 
 def _measure_one(
     folder: Path,
     number: int,
     job: Mapping[str, Any],
-    measure: Callable[..., Iterable[Mapping[str, Any]]],
+    measure: Callable[..., Measured],
     warm_up: Callable[[list[Mapping[str, Any]]], None],
 ) -> NoReturn:
     warm_up([job])
-    lines = [json.dumps({**job, **measured}) + "\n" for measured in measure(**job)]
+    lines = [json.dumps({**job, **measured}) + "\n" for measured in _each(measure(**job))]
     with replacing(job_file(folder, number)) as temporary:
         temporary.write_text("".join(lines), encoding="utf-8")
     raise JobDone

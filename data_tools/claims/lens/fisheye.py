@@ -16,20 +16,22 @@ that were trained on such photographs.
 
 import argparse
 import itertools
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import plot_deviations, summarise, with_deviation
+from data_tools.claims.kit.figures import plot_deviations, subplots, summarise
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic.geometry import first_hits
 from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.tracer import World, points_along, radiance
 from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
 from minisplat_ref.interface.palette import BLUE, GREY, RED
-from minisplat_ref.interface.reporting import describe_machine, markdown_table
+from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io.lens import Lens, undistort
 from minisplat_ref.mechanisms.cameras.models import PERSPECTIVE, model_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -172,36 +174,27 @@ def _psnr(squares: Floats) -> float:
 
 def run(args: argparse.Namespace) -> kit.Report:
     """Photograph the rooms, train all arms in each, and measure."""
-    rooms: dict[int, Photographs] = {}
-
-    def measure(arm: str, seed: int) -> list[dict[str, Any]]:
-        if seed not in rooms:
-            rooms.clear()
-            rooms[seed] = take_photographs(args.width, seed)
-        return [train_and_measure(rooms[seed], arm, args.iterations, seed)]
-
+    photographs = lru_cache(maxsize=1)(partial(take_photographs, args.width))
     settings = {**kit.settings_of(args, "width", "iterations"), "machine": describe_machine()}
-    jobs = [{"arm": arm, "seed": seed} for seed in range(args.seeds) for arm in ARMS]
-    records = [record for record in kit.resume(args.out, settings, jobs, measure) if record["seed"] < args.seeds]
-    rows = []
-    for arm in ARMS:
-        own = [record for record in records if record["arm"] == arm]
-        rows.append([arm, *(with_deviation([record[name] for record in own], 2) for name in MEASURES)])
+    records = kit.resume(
+        args.out,
+        settings,
+        kit.jobs_of(seed=range(args.seeds), arm=ARMS),
+        lambda seed, arm: train_and_measure(photographs(seed), arm, args.iterations, seed),
+    )
     text = (
         f"A fisheye of {ANGLE:g} degrees, {args.width} x {3 * args.width // 4}; undistortion keeps"
         f" {records[0]['share kept']:.1%} of its pixels; {records[0]['gaussians']:,} Gaussians;"
         f" {args.iterations:,} iterations, {args.seeds} seeds; {settings['machine']}\n\nPSNR on held-out views, dB\n\n"
-        + markdown_table(["arm", *MEASURES.values()], rows)
+        + table(records, {"arm": "arm"}, [(heading, spread(name, 2)) for name, heading in MEASURES.items()])
     )
-    arms = kit.arms_of(records, "arm", list(MEASURES))
     result = {**settings, "psnr": summarise(records, "arm", MEASURES), "records": records}
-    return kit.Report(result, draw(records), text, arms)
+    return kit.Report(result, draw(records), text, kit.arms_of(records, "arm", list(MEASURES)))
 
 
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Draw the PSNR of held-out photographs of the fisheye against the angle to the axis."""
-    figure = Figure(figsize=(6.0, 3.8), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((6.0, 3.8))
     middles = [(low + high) / 2 for low, high in itertools.pairwise(RINGS)]
     for arm, (_, _, color) in ARMS.items():
         of_seeds = [record["rings"] for record in records if record["arm"] == arm]

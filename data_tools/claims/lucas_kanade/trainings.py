@@ -20,7 +20,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import with_deviation
+from data_tools.claims.kit.figures import group, subplots
+from data_tools.claims.kit.tables import spread, table
 from data_tools.claims.lucas_kanade.body import ARC, RADIUS, Body, camera_at, film, make_body
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.lucas_kanade.losses import blended_steps, next_view, rendered_flow
@@ -43,12 +44,12 @@ ALPHA_MIN = 0.5  # of a pixel that shows the body
 TIMES = np.linspace(0, 1, 5)  # at which centres are compared
 CAMERAS = {"still": 0.0, "slow": ARC}
 LOSSES = ("no flow loss", "flow of the photographs", "true flow")
-MEASURES = {
-    "psnr": ("held-out PSNR dB", 2),
-    "flow": ("flow error px", 3),
-    "path": ("path error px", 2),
-    "path_3d": ("path error, % of radius", 1),
-}
+COLUMNS = (
+    ("held-out PSNR dB", spread("psnr", 2)),
+    ("flow error px", spread("flow", 3)),
+    ("path error px", spread("path", 2)),
+    ("path error, % of radius", spread("path_3d", 1)),
+)
 
 
 # --- forms ---
@@ -56,12 +57,9 @@ MEASURES = {
 
 def run_forms(args: argparse.Namespace) -> str:
     """Return a table of how far the forms are from each other, and from where the warp leads."""
-    rows: dict[str, list[float]] = {}
-    for seed in range(args.seeds):
-        for name, value in compare_forms(seed).items():
-            rows.setdefault(name, []).append(value)
-    table = [[name, f"{max(values):.1e}"] for name, values in rows.items()]
-    return markdown_table([f"largest over {args.seeds} seeds, lengths in radii", "error"], table)
+    found = [compare_forms(seed) for seed in range(args.seeds)]
+    rows = [[name, f"{max(errors[name] for errors in found):.1e}"] for name in found[0]]
+    return markdown_table([f"largest over {args.seeds} seeds, lengths in radii", "error"], rows)
 
 
 def compare_forms(seed: int) -> dict[str, float]:
@@ -120,21 +118,21 @@ def run_body(args: argparse.Namespace) -> kit.Report:
     """Train the arms, and draw how far centres are from their paths."""
     scene = film(make_body(np.random.default_rng(0)), 0.0)
     settings = {**kit.settings_of(args, "iterations"), **kit.describe_scene(scene)}
-    jobs = [
-        {"arm": f"{camera}, {loss}", "camera": camera, "loss": loss, "seed": seed}
-        for seed in args.seeds
-        for camera in CAMERAS
-        for loss in LOSSES
-    ]
+    jobs = kit.jobs_of(seed=args.seeds, camera=CAMERAS, loss=LOSSES)
+    jobs = [{"arm": f"{job['camera']}, {job['loss']}", **job} for job in jobs]
 
-    def measure(arm: str, camera: str, loss: str, seed: int) -> list[dict[str, Any]]:
-        return [outcome(CAMERAS[camera], loss, args.iterations, seed)]
+    def measure(arm: str, seed: int, camera: str, loss: str) -> dict[str, Any]:
+        return outcome(CAMERAS[camera], loss, args.iterations, seed)
 
     found = kit.resume(args.out, settings, jobs, measure)
     records = [next(record for record in found if job.items() <= record.items()) for job in jobs]
-    text = f"{kit.title(settings)}; {kit.seeds_of(args)}\n\n{table(records)}"
+    flow = spread("photographed_flow", 3)
+    of_photographs = ", ".join(f"{camera} {flow(own)}" for camera, own in group(records, "camera").items())
+    text = f"{kit.title(settings)}; {kit.seeds_of(args)}\n\n{table(records, {'arm': 'camera, arm'}, COLUMNS)}\n\n"
+    text += f"error of the photographs' flow, px: {of_photographs}"
     result = {**settings, "seeds": list(args.seeds), "records": records}
-    return kit.Report(result, draw(records), text, kit.arms_of(records, "arm", tuple(MEASURES)))
+    arms = kit.arms_of(records, "arm", ("psnr", "flow", "path", "path_3d"))
+    return kit.Report(result, draw(records), text, arms)
 
 
 def outcome(arc: float, loss: str, iterations: int, seed: int) -> dict[str, Any]:
@@ -226,24 +224,10 @@ def _rms(steps: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum(steps.astype(np.float64) ** 2, axis=1))))
 
 
-def table(records: list[dict[str, Any]]) -> str:
-    """Return the measures by camera and arm."""
-    rows = []
-    for arm in dict.fromkeys(record["arm"] for record in records):
-        own = [record for record in records if record["arm"] == arm]
-        rows.append([arm, *(with_deviation([r[name] for r in own], digits) for name, (_, digits) in MEASURES.items())])
-    found = [
-        f"{camera} {with_deviation([r['photographed_flow'] for r in records if r['camera'] == camera], 3)}"
-        for camera in CAMERAS
-    ]
-    heading = ["camera, arm", *(label for label, _ in MEASURES.values())]
-    return f"{markdown_table(heading, rows)}\n\nerror of the photographs' flow, px: {', '.join(found)}"
-
-
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Draw the errors of the paths over time, means over the seeds."""
-    figure = Figure(figsize=(7, 3), layout="constrained")
-    for ax, camera in zip(figure.subplots(1, len(CAMERAS), sharey=True), CAMERAS, strict=True):
+    figure, panels = subplots((7, 3), 1, len(CAMERAS), sharey=True)
+    for ax, camera in zip(panels, CAMERAS, strict=True):
         for loss in LOSSES:
             paths = [record["paths"] for record in records if record["arm"] == f"{camera}, {loss}"]
             ax.plot(TIMES, np.mean(paths, axis=0), marker="o", label=loss)

@@ -13,14 +13,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import plot_deviations, with_deviation
+from data_tools.claims.kit.figures import group, plot_curves, subplots
+from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import SCENE_NAMES
 from minisplat_ref.extensions.mixed.method import MIXED as RECIPE
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simplify_hulls
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
-from minisplat_ref.interface.reporting import describe_machine, markdown_table
+from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
@@ -30,6 +31,13 @@ from minisplat_ref.types import Scene
 
 ALL, PLAIN, GROUPS, MIXED = "3DGS, all points", "3DGS, as many floats", "3DGS, one for each group", "mixed"
 COLORS = {ALL: OCHRE, PLAIN: GREY, GROUPS: BLUE, MIXED: RED}
+COLUMNS = (
+    ("number", first("number", ",")),
+    ("floats", first("n_floats", ",")),
+    ("ellipses, lines, triangles", first(lambda row: ", ".join(f"{number:,}" for number in row["kinds"]))),
+    ("test PSNR", spread("psnr", 2)),
+    ("test SSIM", spread("ssim", 4)),
+)
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -37,9 +45,9 @@ def run(args: argparse.Namespace) -> kit.Report:
     scenes = [kit.read_scene(s, 1 if s in SCENE_NAMES else args.downscale) for s in args.scenes]
     rows = [row for scene in scenes for row in outcomes(scene, args.iterations, args.seeds)]
     result = {**kit.settings_of(args, "iterations", "seeds", "downscale"), "rows": rows, "machine": describe_machine()}
-    heading = ["scene", "primitives", "number", "floats", "ellipses, lines, triangles", "test PSNR", "test SSIM"]
     arms = kit.arms_of(rows, "primitives", ("psnr", "ssim"))
-    return kit.Report(result, draw(rows), markdown_table(heading, [to_line(row) for row in rows]), arms)
+    text = table(rows, {"scene": "scene", "primitives": "primitives"}, COLUMNS)
+    return kit.Report(result, draw(rows), text, arms)
 
 
 def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]]:
@@ -81,22 +89,13 @@ def train_and_measure(recipe: Recipe, scene: Scene, iterations: int, n_seeds: in
     return {**row, "kinds": kinds}
 
 
-def to_line(row: dict[str, Any]) -> list[str]:
-    """Return a line of the table."""
-    kinds = ", ".join(f"{number:,}" for number in row["kinds"])
-    measures = [with_deviation(row["psnr"], 2), with_deviation(row["ssim"], 4)]
-    return [row["scene"], row["primitives"], f"{row['number']:,}", f"{row['n_floats']:,}", kinds, *measures]
-
-
 def draw(rows: list[dict[str, Any]]) -> Figure:
     """Draw the test PSNR of each population over its floats, a panel for each scene."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    figure = Figure(figsize=(4.2 * len(scenes), 3.4), layout="constrained")
-    for i, scene in enumerate(scenes):
-        axes = figure.add_subplot(1, len(scenes), i + 1)
-        for row in (row for row in rows if row["scene"] == scene):
-            name = row["primitives"]
-            plot_deviations(axes, [row["n_floats"] / 1e6], [row["psnr"]], color=COLORS[name], label=name)
+    scenes = group(rows, "scene")
+    figure, panels = subplots((4.2 * len(scenes), 3.4), 1, len(scenes), squeeze=False)
+    for axes, (scene, own) in zip(panels[0], scenes.items(), strict=True):
+        in_millions = [{**row, "millions": row["n_floats"] / 1e6} for row in own]
+        plot_curves(axes, in_millions, "millions", "psnr", COLORS, key="primitives")
         axes.set(title=scene, xlabel="floats (millions)", ylabel="test PSNR (dB)")
         axes.margins(0.2)
         axes.legend()

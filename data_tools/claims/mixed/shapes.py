@@ -16,7 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import beside_images, with_deviation
+from data_tools.claims.kit.figures import beside_images
+from data_tools.claims.kit.tables import first, spread, table
 from data_tools.claims.mixed import fit
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.interface.reporting import markdown_table
@@ -36,7 +37,8 @@ def run(name: str, args: argparse.Namespace) -> kit.Report:
     rows, images = outcomes(name, args.iterations, args.seeds)
     needed = [min_number(rows, *pair) for pair in dict.fromkeys((row["image"], row["kind"]) for row in rows)]
     result = {**kit.settings_of(args, "iterations", "seeds"), "rows": rows, "needed": needed}
-    text = markdown_table(["image", "kind", "number", "floats", "PSNR", "best"], [to_line(row) for row in rows])
+    keys = {"image": "image", "kind": "kind", "number": "number", "n_floats": "floats"}
+    text = table(rows, keys, (("PSNR", spread("psnr", 1)), ("best", first(lambda row: max(row["psnr"]), ".1f"))))
     heading = ["image", "kind", f"for {ENOUGH:.0f} dB at best", "floats"]
     text += "\n\n" + markdown_table(heading, [[str(value) for value in row.values()] for row in needed])
     return kit.Report(result, draw(rows, images), text)
@@ -76,12 +78,6 @@ def min_number(rows: list[dict[str, Any]], subject: str, kind: str) -> dict[str,
     enough = [row for row in of_kind if max(row["psnr"]) >= ENOUGH]
     number, n_floats = (enough[0]["number"], enough[0]["n_floats"]) if enough else (f"> {of_kind[-1]['number']}", "")
     return {"image": subject, "kind": kind, "number": number, "n_floats": n_floats}
-
-
-def to_line(row: dict[str, Any]) -> list[str]:
-    """Return a line of the table."""
-    measures = [with_deviation(row["psnr"], 1), f"{max(row['psnr']):.1f}"]
-    return [row["image"], row["kind"], str(row["number"]), str(row["n_floats"]), *measures]
 
 
 def draw(rows: list[dict[str, Any]], images: dict[str, Any]) -> Figure:

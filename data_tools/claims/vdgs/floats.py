@@ -5,19 +5,19 @@ have the floats of its network and hash grid. Numbers stay, and all of the sched
 """
 
 import argparse
+from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import plot_deviations, with_deviation
+from data_tools.claims.kit.figures import group, plot_deviations, subplots
+from data_tools.claims.kit.tables import first, spread, table
 from data_tools.claims.vdgs.pane import floats_of
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
 from minisplat_ref.interface.palette import BLUE
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
@@ -64,22 +64,19 @@ def run(args: argparse.Namespace) -> kit.Report:
     scene = kit.read_scene(args.scene, args.downscale)
     n = min(args.gaussians, len(scene.points))
     settings = {**kit.describe_scene(scene), "iterations": args.iterations, "gaussians": n}
-    jobs = [{"arm": arm, "seed": seed} for arm in arms(args.iterations) for seed in range(args.seeds)]
-    records = kit.resume(args.out, settings, jobs, lambda **job: [measure(scene, args.iterations, n, **job)])
-    by_arm = kit.arms_of(records, "arm", ("psnr",))
-    psnrs = {arm: [value for (value,) in values] for arm, values in by_arm.items()}
-    rows = []
-    for arm, values in psnrs.items():
-        own = next(record for record in records if record["arm"] == arm)
-        gains = np.subtract(values, psnrs[HARMONICS]).tolist()
-        rows.append(
-            [arm, f"{own['gaussians']:,}", f"{own['floats']:,}", with_deviation(values, 2), with_deviation(gains, 2)]
-        )
-    table = markdown_table(["arm", "Gaussians", "floats", "PSNR dB", "gain, seed by seed"], rows)
-    figure = Figure(figsize=(6, 3.4), layout="constrained")
-    axes = figure.subplots()
+    jobs = kit.jobs_of(arm=arms(args.iterations), seed=range(args.seeds))
+    records = kit.resume(args.out, settings, jobs, partial(measure, scene, args.iterations, n))
+    plain = {record["seed"]: record["psnr"] for record in records if record["arm"] == HARMONICS}
+    columns = (
+        ("Gaussians", first("gaussians", ",")),
+        ("floats", first("floats", ",")),
+        ("PSNR dB", spread("psnr", 2)),
+        ("gain, seed by seed", spread(lambda record: record["psnr"] - plain[record["seed"]], 2)),
+    )
+    figure, axes = subplots((6, 3.4))
+    psnrs = {arm: [record["psnr"] for record in own] for arm, own in group(records, "arm").items()}
     plot_deviations(axes, list(psnrs), list(psnrs.values()), color=BLUE, fmt="o")
     axes.set(title=f"PSNR (dB) with {FLOATS * n:,} floats")
-    return kit.Report(
-        {**settings, "seeds": args.seeds, "records": records}, figure, f"{kit.title(settings)}\n\n{table}", arms=by_arm
-    )
+    text = f"{kit.title(settings)}\n\n{table(records, {'arm': 'arm'}, columns)}"
+    result = {**settings, "seeds": args.seeds, "records": records}
+    return kit.Report(result, figure, text, kit.arms_of(records, "arm", ("psnr",)))

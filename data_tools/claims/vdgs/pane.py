@@ -22,12 +22,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import summarise, with_deviation
+from data_tools.claims.kit.figures import subplots, summarise
+from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.vdgs import modes
 from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT, as_seen
 from minisplat_ref.interface.palette import BLUE, OCHRE, RED
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.networks.directions import directions
 from minisplat_ref.mechanisms.networks.networks import COMPILED
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -49,6 +49,12 @@ F0 = 0.2
 NORMAL = np.array([0.0, -1.0, 0.0])
 HARMONICS, TIMES, PLUS = "harmonics", "opacity_times", "opacity_plus"
 COLORS = {HARMONICS: BLUE, TIMES: RED, PLUS: OCHRE}
+COLUMNS = (
+    ("Gaussians", first("gaussians", ",")),
+    ("floats", first("floats", ",")),
+    ("PSNR dB", spread("psnr", 2)),
+    ("error of opacity", spread("opacity_rmse", 3)),
+)
 
 
 def schlick(cosines: Floats, f0: float = F0) -> Floats:
@@ -176,23 +182,15 @@ def run(args: argparse.Namespace) -> kit.Report:
     for seed in kit.with_progress(range(args.seeds), "seeds"):
         found, curves = measure(seed, args.iterations)
         records += found
-    rows = []
-    for name in COLORS:
-        own = [record for record in records if record["arm"] == name]
-        values = {key: [record[key] for record in own] for key in ("psnr", "opacity_rmse")}
-        counts = [f"{own[0][key]:,}" for key in ("gaussians", "floats")]
-        rows.append([name, *counts, with_deviation(values["psnr"], 2), with_deviation(values["opacity_rmse"], 3)])
-    text = markdown_table(["arm", "Gaussians", "floats", "PSNR dB", "error of opacity"], rows)
     result = {**kit.settings_of(args, "seeds", "iterations"), "f0": F0, "records": records}
     result["summary"] = summarise(records, "arm", ("psnr", "opacity_rmse"))
-    arms_ = kit.arms_of(records, "arm", ("psnr", "opacity_rmse"))
-    return kit.Report(result, draw(curves), text, arms=arms_)
+    compared = kit.arms_of(records, "arm", ("psnr", "opacity_rmse"))
+    return kit.Report(result, draw(curves), table(records, {"arm": "arm"}, COLUMNS), compared)
 
 
 def draw(curves: dict[str, Any]) -> Figure:
     """Plot the opacities of the last seed over the angle, beside Schlick's formula."""
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
-    axes = figure.subplots(1, len(COLORS), sharey=True)
+    figure, axes = subplots((10, 3.6), 1, len(COLORS), sharey=True)
     line = np.linspace(0, 85, 100)
     for ax, (name, color) in zip(axes, COLORS.items(), strict=True):
         ax.plot(curves["angles"].ravel(), curves[name].ravel(), ".", ms=3, color=color, label=name)

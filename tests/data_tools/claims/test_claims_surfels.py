@@ -15,7 +15,7 @@ from minisplat_ref.types import RenderOutput
 def test_the_losses_act_in_the_claim():
     """Each arm that weighs a loss differently ends elsewhere."""
     made = make_scene("room", n_views=6, width=32, height=24, supersampling=1, n_points=150)
-    found = [outcome(made, arm, 40, 0)["psnr"] for arm in ("surfels without", "normal_consistency", "both")]
+    found = [outcome(made, 40, arm, 0)["psnr"] for arm in ("surfels without", "normal_consistency", "both")]
     assert len(set(found)) == 3 and len(ARMS) == 5
 
 
@@ -31,7 +31,7 @@ def test_the_claim_measures_the_truth_as_it_is(monkeypatch):
         return RenderOutput(image if wants else image[..., :3], alpha, None, None), None
 
     monkeypatch.setattr("minisplat_ref.rendering.RenderSettings.render", render)
-    found = outcome(made, "surfels without", 1, 0)
+    found = outcome(made, 1, "surfels without", 0)
     assert found["depth_error"] == pytest.approx(2.0, abs=1e-6) and found["normal_error"] < 1
 
 
