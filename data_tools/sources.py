@@ -1,4 +1,4 @@
-"""What the tools that change the code need: a copy of it, the test files that import a module, where types stand."""
+"""Sources for tools that change the code: a copy of it, the test files that import a module, the places of types."""
 
 import ast
 import shutil

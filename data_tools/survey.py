@@ -1,4 +1,4 @@
-"""Which command of the oracle notices which error: errors are planted one at a time, and every command is run.
+"""Survey which command of the oracle notices which error: errors are planted one at a time, every command is run.
 
 A planted error is a changed line of one function (:mod:`data_tools.survey_errors`). In a function of
 Python it is planted in the running program, and the commands are called; kernels that contain it are recompiled, in

@@ -161,11 +161,10 @@ def run(args: argparse.Namespace) -> kit.Report:
     records = kit.resume(
         args.out,
         settings,
-        [{"condition": c, "recipe": r, "seed": s} for c in args.conditions for s in args.seeds for r in recipes],
-        lambda condition, recipe, seed: [measure(conditions[condition](scene), recipes[recipe], seed)],
+        kit.jobs_of(condition=args.conditions, seed=args.seeds, recipe=recipes),
+        lambda condition, seed, recipe: measure(conditions[condition](scene), recipes[recipe], seed),
         lambda missing: warm_up(scene, recipes.values() if missing else ()),
     )
-    records = [r for r in records if r["seed"] in args.seeds and r["condition"] in args.conditions]
     as_decided = sorted(records, key=lambda record: record["recipe"] != "adaptive")  # its row stays
     names, alike = kit.leave_out_idle(kit.arms_of(as_decided, "recipe", ("psnr", "ssim", "n_gaussians", "n_numbers")))
     measured, records = records, [record for record in records if record["recipe"] in names]

@@ -24,7 +24,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import argument, declare, trainings
-from data_tools.claims.kit.figures import plot_deviations, set_ticks, with_deviation
+from data_tools.claims.kit.figures import plot_deviations, set_ticks, subplots, with_deviation
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression.msz import MSZ
@@ -40,6 +41,11 @@ from minisplat_ref.types import Floats, Gaussians, View
 SHRUNK = (1.0, 1 / 8, 1 / 64, 1 / 512)  # sizes of the scene, relative to the original
 SHRUNK_LEVEL = 5  # of .msz
 COLORS = {"ply": GREY, "msz": BLUE, "spz": RED, "sog": OCHRE}
+COLUMNS = (
+    ("bytes", mean("n_bytes")),
+    ("bytes per Gaussian", mean("bytes_per_gaussian", 1)),
+    ("dB lost", spread("drop", 3)),
+)
 
 
 class Point(NamedTuple):
@@ -74,7 +80,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     result = {**kit.describe_trainings(args, scene), "psnr": psnrs, "gaussians": counts, "runs": runs, "shrunk": drops}
     result |= {"spz_apart_from_harmonics": kept}
     text = f"{scene.name}: {with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n\n"
-    text += markdown_table(["file", "bytes", "bytes per Gaussian", "dB lost"], to_rows(runs))
+    text += table([point for run in runs for point in run], {"name": "file"}, COLUMNS)
     text += f"\n\n.spz with the harmonics kept as they are loses {with_deviation(kept, 3)} dB"
     text += "\n\ndB lost by size of the scene\n\n"
     rows = [[name, *(with_deviation(d, 3) for d in zip(*of_seeds, strict=True))] for name, of_seeds in drops.items()]
@@ -166,22 +172,9 @@ def shrink_camera(view: View, factor: float) -> Any:
     return view.camera._replace(cam_from_world_t=view.camera.cam_from_world_t * factor)
 
 
-def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
-    """Return the lines of the table: means and deviations over the seeds."""
-    rows = []
-    for of_seeds in zip(*runs, strict=True):
-        sizes = [f"{np.mean([point[name] for point in of_seeds]):,.{digits}f}" for name, digits in _SIZES.items()]
-        rows.append([of_seeds[0]["name"], *sizes, with_deviation([point["drop"] for point in of_seeds], 3)])
-    return rows
-
-
-_SIZES = {"n_bytes": 0, "bytes_per_gaussian": 1}  # digits in the table
-
-
 def draw(result: dict[str, Any]) -> Figure:
     """Draw loss against bytes, and loss against the size of the scene."""
-    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
-    rate, small = figure.subplots(1, 2, width_ratios=(3, 2))
+    figure, (rate, small) = subplots((9.6, 3.6), 1, 2, width_ratios=(3, 2))
     for kind in COLORS:
         _draw_kind(rate, kind, result["runs"])
     rate.axhline(0, color=GREY, linewidth=0.8)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, PLY, SCENE, declare, downscale, iterations, number, seed
+from data_tools.claims.kit.figures import subplots
 from minisplat_ref.interface.palette import BLUE, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io import load_ply
@@ -184,8 +185,7 @@ def to_rows(result: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
     """Draw the culled part of each view, the times of all iterations, and the loss of PSNR in each view."""
-    figure = Figure(figsize=(11, 3), layout="constrained")
-    culled, times, cost = figure.subplots(1, 3)
+    figure, (culled, times, cost) = subplots((11, 3), 1, 3)
     for (name, measures), color in zip(places.items(), (BLUE, RED), strict=False):
         views = np.arange(1, len(measures["psnr"]) + 1)
         culled.plot(

@@ -25,6 +25,7 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_SCENE, argument, declare, number
+from data_tools.claims.kit.figures import group, subplots
 from data_tools.claims.pose import move
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
@@ -146,12 +147,11 @@ def run(args: argparse.Namespace) -> kit.Report:
     settings = {"scene": description["scene"], "downscale": args.downscale, "asked": list(args.asked)}
     names = args.conditions or [name for name in CONDITIONS if name != "sky" or not Path(args.scene).exists()]
 
-    def measured(condition: str, seed: int) -> list[dict[str, Any]]:
-        return [decide(CONDITIONS[condition](scene, np.random.default_rng(seed)), seed, args.asked)]
+    def measure(seed: int, condition: str) -> dict[str, Any]:
+        return decide(CONDITIONS[condition](scene, np.random.default_rng(seed)), seed, args.asked)
 
-    jobs = [{"condition": name, "seed": seed} for seed in range(args.trials) for name in names]
-    records = kit.resume(args.out, settings, jobs, measured)
-    records = [record for record in records if record["seed"] < args.trials and record["condition"] in names]
+    jobs = kit.jobs_of(seed=range(args.trials), condition=names)
+    records = kit.resume(args.out, settings, jobs, measure)
     summary = summarise(records, args.asked)
     result = {**description, **settings, "trials": args.trials, "summary": summary, "runs": records}
     heading = ["photographs", "trials", *(f"{name} switched on" for name in args.asked)]
@@ -184,12 +184,11 @@ def decide(scene: Scene, seed: int, asked: Sequence[str]) -> dict[str, Any]:
 
 def summarise(records: Sequence[Mapping[str, Any]], asked: Sequence[str]) -> dict[str, dict[str, int]]:
     """Return for each condition the number of trials, and of those that switched on what is asked."""
-    summary = {}
-    for name in CONDITIONS:
-        own = [record for record in records if record["condition"] == name]
-        counts = {what: sum(what in record["switched_on"] for record in own) for what in asked}
-        summary[name] = {"trials": len(own), **counts}
-    return summary
+    trials = dict.fromkeys(CONDITIONS, ()) | group(records, "condition")
+    return {
+        name: {"trials": len(own), **{what: sum(what in record["switched_on"] for record in own) for what in asked}}
+        for name, own in trials.items()
+    }
 
 
 def to_rows(summary: Mapping[str, Mapping[str, int]]) -> list[list[str]]:
@@ -200,8 +199,7 @@ def to_rows(summary: Mapping[str, Mapping[str, int]]) -> list[list[str]]:
 def draw(summary: Mapping[str, Mapping[str, int]], asked: Sequence[str]) -> Figure:
     """Draw the part of the trials that switched on what is asked."""
     summary = {name: row for name, row in summary.items() if row["trials"]}
-    figure = Figure(figsize=(7, 2.6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((7, 2.6))
     for k, what in enumerate(asked):
         shares = [100 * row[what] / row["trials"] for row in summary.values()]
         places = np.arange(len(summary)) + HEIGHT * (k - 0.5 * (len(asked) - 1))

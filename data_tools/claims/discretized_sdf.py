@@ -15,7 +15,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, seeds
@@ -102,8 +101,7 @@ def run_sphere(args: argparse.Namespace) -> kit.Report:
             points = projected(moved.means, moved.quats, moved.distances)
             errors[arm] = np.linalg.norm(points, axis=1) - 1
     described = {**kit.settings_of(args, "seeds"), "surfels": N_SURFELS, "offset": OFFSET, "steps": STEPS}
-    figure = Figure(figsize=(5, 3), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots((5, 3))
     for arm, values in errors.items():
         ax.hist(values, 40, histtype="step", label=f"opacity {arm}")
     ax.set(xlabel="distance of projected centres from the sphere, in radii", ylabel="surfels")

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit import recovery
 from data_tools.claims.kit.claim import CALIBRATION, declare
+from data_tools.claims.kit.figures import subplots
 from data_tools.claims.kit.recovery import ARMS, COLORS
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import evaluate
@@ -135,8 +136,7 @@ def measure_held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> floa
 
 def draw(result: dict[str, dict[str, Any]]) -> Figure:
     """Draw how the maps change the mean colour, each photograph's error, and the PSNR of the three trainings."""
-    figure = Figure(figsize=(10, 3), layout="constrained")
-    maps, errors, quality = figure.subplots(1, 3)
+    figure, (maps, errors, quality) = subplots((10, 3), 1, 3)
     maps.axline((0.5, 0.5), slope=1, color="black", linewidth=0.5)
     for arm in ARMS[1:]:
         means = result[arm]["mean_color"]

@@ -25,7 +25,7 @@ from data_tools.claims import kit
 from data_tools.claims.adaptive import ITERATIONS, warm_up
 from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_OUT, SEEDS, argument, declare, number
 from data_tools.claims.kit.coverage import count_covering_views
-from data_tools.claims.kit.figures import standard_error
+from data_tools.claims.kit.figures import standard_error, subplots
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.interface.palette import SERIES
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
@@ -202,23 +202,16 @@ def run(args: argparse.Namespace) -> kit.Report:
             scenes[name] = scene, views
     if not scenes:
         raise InputError(f"no scene has the photographs for {args.folds} folds; give another --folds")
-    jobs = [
-        {"scene": name, "fold": k, "recipe": text, "seed": seed}
-        for name in scenes
-        for k in range(args.folds)
-        for seed in args.seeds
-        for text in recipes
-    ]
+    jobs = kit.jobs_of(scene=scenes, fold=range(args.folds), seed=args.seeds, recipe=recipes)
     settings = {"folds": args.folds, "long_side": args.long_side}
     first = next(iter(scenes.values()))
     records = kit.resume(
         args.out,
         settings,
         jobs,
-        lambda scene, fold, recipe, seed: [measure(make_fold(*scenes[scene], args.folds, fold), recipes[recipe], seed)],
+        lambda scene, fold, seed, recipe: measure(make_fold(*scenes[scene], args.folds, fold), recipes[recipe], seed),
         lambda missing: warm_up(first[0], recipes.values() if missing else ()),
     )
-    records = [r for r in records if r["scene"] in scenes and r["recipe"] in recipes and r["seed"] in args.seeds]
     measures = [{**r, "psnr": [photograph["psnr"] for photograph in r["photographs"]]} for r in records]
     names, alike = kit.leave_out_idle(kit.arms_of(measures, "recipe", ("psnr", "n_gaussians")))
     measured, records = records, [r for r in records if r["recipe"] in names]
@@ -342,8 +335,7 @@ def leave_one_scene_out(records: Sequence[Mapping[str, Any]], recipes: Sequence[
 def draw(records: Sequence[Mapping[str, Any]], recipes: Sequence[str]) -> Figure:
     """Draw the colour-corrected PSNR of each photograph, a row for each scene, its medians as lines."""
     scenes = list(dict.fromkeys(record["scene"] for record in records))
-    figure = Figure(figsize=(7.5, 1.0 + 0.55 * len(scenes)), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((7.5, 1.0 + 0.55 * len(scenes)))
     for k, recipe in enumerate(recipes):
         color = SERIES[k % len(SERIES)]
         for row, scene in enumerate(scenes):

@@ -1,4 +1,4 @@
-"""What ``simplify --max-drop`` promises and keeps: dB that were asked for beside dB that test views lose.
+"""The promise of ``simplify --max-drop``: dB that were asked for beside dB that test views lose.
 
 The claim is ours. A scene is trained with every seed. For every limit a size is chosen as ``minisplat-ref simplify``
 does it, on training views that are held out in turn. Then the model of this size is made, and compared with that of the
@@ -29,6 +29,7 @@ from data_tools.claims.kit.claim import (
     recipe,
 )
 from data_tools.claims.kit.conditions import get_condition
+from data_tools.claims.kit.figures import subplots
 from minisplat_ref.app.runs.opened_run import Run, check_views
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.rate_distortion import paired_drop
@@ -129,8 +130,7 @@ def to_table(records: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list
 
 def draw(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw what is lost against what was asked for; a promise that is kept lies on the diagonal or below."""
-    figure = Figure(figsize=(4.6, 4.0), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((4.6, 4.0))
     seeds = sorted({record["seed"] for record in records})
     for seed, color in zip(seeds, COLORS * len(seeds), strict=False):
         own = sorted((r for r in records if r["seed"] == seed), key=lambda record: record["limit"])

@@ -7,7 +7,7 @@ from these maps by the rules of the recipe, and one that is off its surface by m
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, number, seeds, synthetic_scene
-from data_tools.claims.kit.figures import mean_and_deviation, with_deviation
+from data_tools.claims.kit.figures import group, plot_curves, subplots
 from data_tools.claims.kit.mesh_distances import OrientedPoints, compare_surfaces
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.mvg.insertion import Insertions, Photographed, Rules, propose, smooth_map
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances, unproject
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between
@@ -190,48 +190,38 @@ def angle(views: list[Photographed], made: SyntheticScene) -> float:
 def tables(records: list[dict[str, Any]]) -> str:
     """Return the tables: wrong points, normals, completeness at an equal count."""
     kinds = [(kind, share) for kind in ("scattered", "shared") for share in SHARES]
-    heads = [f"{kind}, {100 * share:g} %" for kind, share in kinds]
 
-    def table(title: str, arms: list[str], cell: Callable[[list[dict[str, Any]]], str]) -> str:
-        rows = [
-            [arm, *(cell([r for r in records if (r["arm"], r["kind"], r["share"]) == (arm, *k)]) for k in kinds)]
-            for arm in arms
-        ]
-        return f"{title}\n\n{markdown_table(['points', *heads], rows)}\n"
+    def by_kind(title: str, arms: Iterable[str], key: str, digits: int) -> str:
+        def at(*kind: Any) -> Callable[[dict[str, Any]], float | None]:
+            return lambda record: record.get(key) if (record["kind"], record["share"]) == kind else None
 
-    def shown(key: str, digits: int) -> Callable[[list[dict[str, Any]]], str]:
-        return lambda some: with_deviation([r[key] for r in some], digits)
+        columns = [(f"{kind}, {100 * share:g} %", spread(at(kind, share), digits)) for kind, share in kinds]
+        own = [record for arm in arms for record in records if record["arm"] == arm]
+        return f"{title}\n\n{table(own, {'arm': 'points'}, columns)}\n"
 
-    normals = ["normals of the map", "normals of the filtered map", RECIPE_ARM]
+    normals = ("normals of the map", "normals of the filtered map", RECIPE_ARM)
     return "\n".join(
         [
-            table("Wrong points (%)", list(ARMS), shown("wrong", 1)),
-            table("Points", list(ARMS), shown("n", 0)),
-            table("Normals, median angle (degrees)", normals, shown("angle", 1)),
-            table("Points compared at an equal count", list(EQUAL), shown("n_equal", 0)),
-            table("Mean distance of the surface to these (mm)", list(EQUAL), shown("completeness", 1)),
-            table(f"F-score of these within {1000 * TAU:g} mm (%)", list(EQUAL), shown("f_score", 1)),
+            by_kind("Wrong points (%)", ARMS, "wrong", 1),
+            by_kind("Points", ARMS, "n", 0),
+            by_kind("Normals, median angle (degrees)", normals, "angle", 1),
+            by_kind("Points compared at an equal count", EQUAL, "n_equal", 0),
+            by_kind("Mean distance of the surface to these (mm)", EQUAL, "completeness", 1),
+            by_kind(f"F-score of these within {1000 * TAU:g} mm (%)", EQUAL, "f_score", 1),
         ]
     )
 
 
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Draw the share of wrong points over the share of wrong pixels."""
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    figure, panels = subplots((9, 3.2), 1, 2, sharey=True)
     colors = {"filter": GREY, RECIPE_ARM: BLUE, "2 views agree": OCHRE}
-    for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("scattered", "shared"), strict=True):
-        for arm, color in colors.items():
-            values = [
-                mean_and_deviation(
-                    [r["wrong"] for r in records if (r["arm"], r["kind"], r["share"]) == (arm, kind, share)]
-                )
-                for share in SHARES
-            ]
-            means, deviations = np.transpose(values)
-            axes.errorbar([100 * share for share in SHARES], means, deviations, marker="o", color=color, label=arm)
+    in_percent = [{**record, "percent": 100 * record["share"]} for record in records if "wrong" in record]
+    for axes, (kind, own) in zip(panels, group(in_percent, "kind").items(), strict=True):
+        plot_curves(axes, own, "percent", "wrong", colors)
         axes.set(title=f"{kind} errors", xlabel="wrong pixels (%)")
-    figure.axes[0].set_ylabel("wrong points (%)")
-    figure.axes[0].legend(frameon=False)
+    panels[0].set_ylabel("wrong points (%)")
+    panels[0].legend(frameon=False)
     return figure
 
 

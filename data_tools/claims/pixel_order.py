@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, Argument, argument, declare, number, seed
-from data_tools.claims.kit.figures import table_of
+from data_tools.claims.kit.figures import subplots, table_of
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, SH_C0, Conventions
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
@@ -105,8 +105,7 @@ def run_rotation(args: argparse.Namespace) -> kit.Report:
 
 def draw_rotation(found: dict[str, dict[str, Any]]) -> Figure:
     """Draw the largest change in each step of the yaw."""
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((8, 4.2))
     for (method, values), color in zip(found.items(), COLORS, strict=True):
         steps = np.maximum(values["yaw"], 1e-17)
         axes.semilogy(np.linspace(-20, 20, len(steps)), steps, color=color, lw=1.2, label=method)
@@ -165,8 +164,7 @@ def run_projection(args: argparse.Namespace) -> kit.Report:
 
 def draw_projection(found: dict[str, list[float]]) -> Figure:
     """Draw the errors against the angle."""
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((6, 4))
     for (name, errors), color in zip(found.items(), (COLORS[0], COLORS[4]), strict=True):
         axes.plot(ANGLES, errors, "o-", color=color, label=name)
     axes.set(title="Error of the footprint, relative", xlabel="degrees off the axis", ylim=(0, None))

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from data_tools.claims import kit
 from data_tools.claims.kit import recovery
 from data_tools.claims.kit.claim import CALIBRATION, argument, declare
+from data_tools.claims.kit.figures import subplots
 from data_tools.claims.kit.recovery import ARMS
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.reporting import markdown_table
@@ -181,8 +182,7 @@ def measure_held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Simila
 
 def draw(result: dict[str, dict[str, Any]]) -> Figure:
     """Draw each camera's error before and after, and the PSNR of the three trainings."""
-    figure = Figure(figsize=(10, 3), layout="constrained")
-    degrees, pixels, quality = figure.subplots(1, 3)
+    figure, (degrees, pixels, quality) = subplots((10, 3), 1, 3)
     recovery.draw_errors(degrees, result, "degrees")
     recovery.draw_errors(pixels, result, "pixels")
     degrees.set(title="rotation against the truth", ylabel="degrees")

@@ -29,7 +29,7 @@ from numpy.typing import DTypeLike
 from data_tools.claims import kit
 from data_tools.claims.adaptive import WARM_UP
 from data_tools.claims.kit.claim import CONTINUES, RESUMED_SCENE, SEEDS, declare, iterations, recipe
-from data_tools.claims.kit.figures import plus_minus, standard_error, summarise
+from data_tools.claims.kit.figures import plus_minus, standard_error, subplots, summarise
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.palette import BLUE, RED
 from minisplat_ref.interface.reporting import markdown_table
@@ -87,8 +87,8 @@ def run(args: argparse.Namespace) -> kit.Report:
             with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
                 train_in_precision(scene, get_recipe(args.recipe, WARM_UP), PRECISIONS[name], 0)
 
-    jobs = [{"precision": name, "seed": seed} for seed in args.seeds for name in PRECISIONS]
-    records = kit.resume(args.out, settings, jobs, partial(measure, scene, recipe), warm_up)
+    jobs = kit.jobs_of(seed=args.seeds, precision=PRECISIONS)
+    records = kit.resume_all(args.out, settings, jobs, partial(measure, scene, recipe), warm_up)  # has STORED, too
     records = [record for record in records if record["seed"] in args.seeds]
     rows = compare(records)
     result = {**description, **settings, "seeds": list(args.seeds), "summary": rows, "runs": records}
@@ -206,8 +206,7 @@ def _cells(name: str, row: Mapping[str, Any]) -> list[str]:
 
 def draw(rows: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw the PSNR with its deviation against the seconds, and against the bytes."""
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = subplots((9, 3.2), 1, 2, sharey=True)
     measures: dict[str, tuple[str, Callable[[str], bool]]] = {
         "seconds": ("processor time (s)", lambda name: name != STORED),
         "megabytes": ("parameters (MB)", lambda name: True),

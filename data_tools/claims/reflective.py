@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, seeds
-from data_tools.claims.kit.figures import show, with_deviation
+from data_tools.claims.kit.figures import show, subplots
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import (
@@ -44,6 +44,11 @@ TILT = 0.05  # radians: standard deviation by which normals are off
 OTHER = np.array([2.3, 0.0, 0.0])  # centre of the black sphere
 INFINITE = 40.0  # logit of a share of 1
 STEPS, RATE = 60, 0.1  # of the search for the environment
+SHADED = (
+    ("PSNR (dB)", spread("psnr", 1)),
+    ("highlight off by (px)", spread("highlight", 2)),
+    ("normals off by (degrees)", spread("normal_error", 2)),
+)
 
 
 class Truth(NamedTuple):
@@ -77,7 +82,7 @@ def run(args: argparse.Namespace) -> kit.Report:
         records += [{"seed": seed, **record} for record in _occlusion(both, rng)]
         records.append({"arm": "environment", "seed": seed, **recover(views[:4], rng)})
     described = {**kit.settings_of(args, "seeds"), "albedo": ALBEDO, "roughness": ROUGHNESS, "tilt": TILT}
-    return kit.Report({**described, "records": records}, draw(views[0], shown), table(records))
+    return kit.Report({**described, "records": records}, draw(views[0], shown), tables(records))
 
 
 def environment() -> Floats:
@@ -261,33 +266,23 @@ def recover(views: list[Truth], rng: np.random.Generator) -> dict[str, float]:
     return {"error_before": errors[0], "error_after": errors[1]}
 
 
-def table(records: list[dict[str, Any]]) -> str:
-    """Return the tables."""
-
-    def of(key: str, digits: int, **chosen: Any) -> str:
-        values = [r[key] for r in records if all(r.get(name) == value for name, value in chosen.items())]
-        return with_deviation(values, digits)
-
-    rows = [
-        [f"{n:,}", f"{tilt:g}", arm, of("psnr", 1, surfels=n, tilt=tilt, arm=arm),
-         of("highlight", 2, surfels=n, tilt=tilt, arm=arm), of("normal_error", 2, surfels=n, tilt=tilt, arm=arm)]
-        for n in N_SURFELS for tilt in (0.0, TILT) for arm in ("per pixel", "per surfel", "harmonics")
-    ]  # fmt: skip
-    heading = ["surfels", "tilt", "shaded", "PSNR (dB)", "highlight off by (px)", "normals off by (degrees)"]
-    arms = ("all of the environment", "with occlusion")
-    hidden = [[arm, of("hidden_psnr", 1, arm=arm), of("seen_psnr", 1, arm=arm)] for arm in arms]
-    before, after = (of(key, 3, arm="environment") for key in ("error_before", "error_after"))
+def tables(records: list[dict[str, Any]]) -> str:
+    """Return the tables: shading, occlusion, and the environment that was sought."""
+    shaded = [record for record in records if "highlight" in record]
+    beside = [record for record in records if "hidden_psnr" in record]
+    sought = [record for record in records if "error_before" in record]
+    hidden = (("where it is hidden", spread("hidden_psnr", 1)), ("elsewhere", spread("seen_psnr", 1)))
+    before, after = (spread(key, 3)(sought) for key in ("error_before", "error_after"))
     return (
-        f"{markdown_table(heading, rows)}\n\nbeside a black sphere, PSNR in dB:\n\n"
-        f"{markdown_table(['reflected', 'where it is hidden', 'elsewhere'], hidden)}\n\n"
+        f"{table(shaded, {'surfels': 'surfels', 'tilt': 'tilt', 'arm': 'shaded'}, SHADED)}\n\n"
+        f"beside a black sphere, PSNR in dB:\n\n{table(beside, {'arm': 'reflected'}, hidden)}\n\n"
         f"environment from images of the sphere, RMS error in sRGB: {before} at the start, {after} after {STEPS} steps"
     )
 
 
 def draw(truth: Truth, shown: dict[str, Floats]) -> Figure:
     """Draw one view: the truth, and each arm with most surfels and tilted normals."""
-    figure = Figure(figsize=(3 * (1 + len(shown)), 2.6), layout="constrained")
-    axes = figure.subplots(1, 1 + len(shown))
+    figure, axes = subplots((3 * (1 + len(shown)), 2.6), 1, 1 + len(shown))
     show(axes[0], np.clip(truth.image, 0, 1), "truth")
     for ax, (arm, image) in zip(axes[1:], shown.items(), strict=True):
         show(ax, np.clip(image[..., :3], 0, 1), arm)

@@ -33,7 +33,7 @@ from data_tools.claims.kit.claim import (
     iterations,
     recipe,
 )
-from data_tools.claims.kit.figures import mean_and_deviation, plus_minus
+from data_tools.claims.kit.figures import group, mean_and_deviation, plus_minus
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.datasets.synthetic.surface import chamfer, unproject_views
 from minisplat_ref.interface.arguments import fraction, list_of
@@ -129,9 +129,6 @@ def counts_to_keep(importance: Floats, fractions: tuple[float, ...]) -> dict[str
 def summarise(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return, for each number and choice, mean and standard deviation over the seeds of every measure."""
     measures = [name for name in runs[0] if name.startswith(("psnr", "chamfer"))]
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in runs:
-        groups.setdefault((row["kept"], row["choice"]), []).append(row)
     return [
         {
             "kept": kept,
@@ -139,7 +136,7 @@ def summarise(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "choice": choice,
             **{name: mean_and_deviation([row[name] for row in rows]) for name in measures},
         }
-        for (kept, choice), rows in groups.items()
+        for (kept, choice), rows in group(runs, "kept", "choice").items()
     ]
 
 
@@ -163,12 +160,15 @@ def to_table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         "chamfer_surface": "to the surface",
     }
     measures = [name for name in headers if name in result["summary"][0]]
-    lines = []
-    for row in result["summary"]:
-        cells = []
-        for name in measures:
-            cells.append(plus_minus(row[name], 2 if name.startswith("psnr") else 4))
-        lines.append([row["kept"], f"{row['n_gaussians']:,}", row["choice"], *cells])
+    lines = [
+        [
+            row["kept"],
+            f"{row['n_gaussians']:,}",
+            row["choice"],
+            *(plus_minus(row[name], 2 if name.startswith("psnr") else 4) for name in measures),
+        ]
+        for row in result["summary"]
+    ]
     return ["kept of the candidates", "Gaussians", "choice", *(headers[name] for name in measures)], lines
 
 

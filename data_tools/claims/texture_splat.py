@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, seeds
-from data_tools.claims.kit.figures import mean_and_deviation, show, with_deviation
+from data_tools.claims.kit.figures import group, mean_and_deviation, show, with_deviation
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.texture_splat.baking import Maps, bake
 from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, with_textures
@@ -207,9 +207,10 @@ def compare(test: list[Maps], albedo: tuple[Floats, ...], normals: tuple[Floats,
 
 def table(records: list[dict[str, Any]]) -> str:
     """Return the tables: first how much textures are ahead, seed by seed, where they cost most; then all arms."""
+    by_arm = group(records, "arm", "T", "steps")
 
     def of(arm: str, size: int, key: str, steps: int = STEPS) -> list[Any]:
-        return [r[key] for r in records if (r["arm"], r["T"], r["steps"]) == (arm, size, steps)]
+        return [record[key] for record in by_arm[arm, size, steps]]
 
     def ahead(arm: str, size: int, key: str) -> str:
         return with_deviation([a - b for a, b in zip(of(TEXTURES, size, key), of(arm, size, key), strict=True)], 2)

@@ -1,4 +1,4 @@
-"""What cases are made of: a small scene on disk, a command run as a user would, and what it said."""
+"""Parts of the cases: a small scene on disk, a command run as a user would, and what it said."""
 
 import contextlib
 import io

@@ -1,4 +1,4 @@
-"""What a reader may do with a damaged file: read it if nothing shows, or refuse it in one line that names the file.
+"""Judge a reader of a damaged file: it may read it if nothing shows, or refuse it in one line that names the file.
 
 Everything else is a finding: another exception, a message of several lines or without the file, a warning in Python's
 own form, more memory than a small multiple of the files, and time. The process that reads may also die or hang, of

@@ -1,4 +1,4 @@
-"""What is fuzzed: for each reader a folder of small files that are right, and the call that reads them."""
+"""Readers that are fuzzed: for each a folder of small files that are right, and the call that reads them."""
 
 import hashlib
 import json

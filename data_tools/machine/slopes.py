@@ -1,4 +1,4 @@
-"""How cost scales: views of the same random scene from few Gaussians to many, and from small images to large.
+"""Scaling of cost: views of the same random scene from few Gaussians to many, and from small images to large.
 
 The cost of a renderer close to its limit is proportional to *hits*, the pairs (pixel, Gaussian) that contribute to the
 image; that of a naive one to all Gaussians times all pixels. The slope is that of a straight line through the

@@ -1,4 +1,4 @@
-"""Which tests are run for a change, and which places are not worth one."""
+"""Mutation: the tests that are run for a change, and the places that are not worth one."""
 
 import random
 import subprocess

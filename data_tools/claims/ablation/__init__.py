@@ -1,4 +1,4 @@
-"""What each mechanism of Mini-Splatting (arXiv 2403.14166) and Mini-Splatting2 (arXiv 2411.12788) is worth."""
+"""Ablation of each mechanism of Mini-Splatting (arXiv 2403.14166) and Mini-Splatting2 (arXiv 2411.12788)."""
 
 from data_tools.claims.ablation import ablation
 from data_tools.claims.kit.claim import (

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.ablation.variants import ACTIONS, DEVIATIONS, FULL, MECHANISMS, variants_of
 from data_tools.claims.kit.conditions import get_condition
-from data_tools.claims.kit.figures import plus_minus, summarise
+from data_tools.claims.kit.figures import plus_minus, subplots, summarise
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.palette import BLUE, RED
 from minisplat_ref.interface.reporting import markdown_table
@@ -55,10 +55,9 @@ def run(args: argparse.Namespace) -> kit.Report:
     settings = {"recipe": recipe.name, "iterations": recipe.iterations, "downscale": args.downscale}
     settings |= {"condition": args.condition}
 
-    jobs = [{"without": name, "seed": seed} for seed in args.seeds for name in variants]
+    jobs = kit.jobs_of(seed=args.seeds, without=variants)
     identity = {**settings, "deviations": args.deviations, "scene": description["scene"]}
-    records = kit.resume(args.out, identity, jobs, lambda without, seed: [measure(scene, variants[without], seed)])
-    records = [record for record in records if record["seed"] in args.seeds]
+    records = kit.resume(args.out, identity, jobs, lambda seed, without: measure(scene, variants[without], seed))
     acts = count_actions(records, variants)
     idle = [name for name, n in acts.items() if n == 0]
     if len(idle) == len(variants) - 1:
@@ -118,8 +117,7 @@ def to_rows(result: Mapping[str, Any]) -> list[list[str]]:
 
 def draw(summary: Mapping[str, Mapping[str, tuple[float, float]]]) -> Figure:
     """Draw for each variant the difference of the PSNR, and the number of Gaussians."""
-    figure = Figure(figsize=(10, 0.34 * len(summary) + 1.2), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    figure, (left, right) = subplots((10, 0.34 * len(summary) + 1.2), 1, 2, sharey=True)
     names = [name if name == FULL else f"without {name}" for name in summary]
     for line, row in enumerate(summary.values()):
         mean, deviation = row["difference"]

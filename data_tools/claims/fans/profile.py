@@ -1,4 +1,4 @@
-"""How well the linear profile of a fan approximates a Gaussian's, seen from the front.
+"""Error of the linear profile of a fan against a Gaussian's, seen from the front.
 
 With the centre at the origin, in standard deviations, at the distance r and the angle theta from the middle of a side
 

@@ -18,7 +18,7 @@ from data_tools.claims import kit
 from data_tools.claims.fans import measures as claims
 from data_tools.claims.fans import profile
 from data_tools.claims.fans.profile import profile_error
-from data_tools.claims.kit.figures import mean_and_deviation, show, table_of
+from data_tools.claims.kit.figures import mean_and_deviation, show, subplots, table_of
 from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.extensions.fans.shapes import FanShape
 from minisplat_ref.extensions.fans.tuning import render_clipped
@@ -62,8 +62,7 @@ def run_profile(args: argparse.Namespace) -> kit.Report:
 
 def draw_profile(result: dict[str, Any]) -> Figure:
     """Draw the error over the reach, and over the angle."""
-    figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = subplots((9.5, 3.6), 1, 2)
     reaches = np.linspace(1.5, 3.5, 41)
     for rim, color in RIM_COLORS.items():
         left.plot(reaches, [100 * profile_error(FanShape(8, k, rim)) for k in reaches], color=color, label=f"rim {rim}")

@@ -1,4 +1,4 @@
-"""What measures a claim: a scene, trainings by seed, records that resume, and the report that is written.
+"""Parts of the measurement of a claim: a scene, trainings by seed, records that resume, the report that is written.
 
 A claim's module measures, draws and returns a :class:`Report`; :func:`carry_out` gives figures their style, and writes
 and prints the report. Trainings take long: with :func:`.records.resume` a claim stores the record of each as soon as it
@@ -22,6 +22,7 @@ from data_tools.claims.kit.claim import FIGURE, RESULT
 from data_tools.claims.kit.figures import STYLE
 from data_tools.claims.kit.records import jobs_of as jobs_of
 from data_tools.claims.kit.records import resume as resume
+from data_tools.claims.kit.records import resume_all as resume_all
 from minisplat_ref.datasets.named_scenes import read_scene as read_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.palette import PNG_DPI

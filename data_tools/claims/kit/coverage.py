@@ -1,4 +1,4 @@
-"""How many other photographs show what a pixel of a photograph shows.
+"""Coverage of a pixel: the number of other photographs that show what it shows.
 
 A pixel whose surface no training photograph shows cannot be rendered rightly, except by luck; its error says nothing
 about a recipe. So that recipes cannot influence what counts, coverage is computed from the sparse points alone: the

@@ -1,4 +1,4 @@
-"""How far a mesh is from the truth: accuracy, completeness, Chamfer distance, F-score, and the error of its normals.
+"""Distances of a mesh from the truth: accuracy, completeness, Chamfer distance, F-score, error of the normals.
 
 With P points drawn on the mesh and the points Q of the true surface, and ``d(p, Q)`` the distance to the nearest point:
 

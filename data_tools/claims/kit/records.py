@@ -1,4 +1,4 @@
-"""What a claim has measured so far, one record for each job, so that it continues where it was interrupted.
+"""Records of what a claim has measured so far, one for each job, so that it continues where it was interrupted.
 
 A job is a training, or a few, with the measurements of what comes out. Jobs are carried out here one after the other;
 or :data:`HAND_OUT` says who carries them out, each in a process of its own, which is the same command with :data:`JOB`
@@ -108,6 +108,23 @@ def resume(
 ) -> list[dict[str, Any]]:
     """Measure the jobs that have no record in the folder, and return the records of all jobs, in the folder's order.
 
+    Left out are records of jobs that the folder has besides, and those whose entries are others than their job's.
+    Parameters are those of :func:`resume_all`.
+    """
+    records = resume_all(folder, settings, jobs, measure, warm_up, nouns)
+    return [record for record in records if any(job.items() <= record.items() for job in jobs)]
+
+
+def resume_all(
+    folder: Path,
+    settings: Mapping[str, Any],
+    jobs: Sequence[Mapping[str, Any]],
+    measure: Callable[..., Measured],
+    warm_up: Callable[[list[Mapping[str, Any]]], None] = lambda missing: None,
+    nouns: str = "trainings",
+) -> list[dict[str, Any]]:
+    """Measure the jobs that have no record in the folder, and return all its records.
+
     Parameters
     ----------
     folder : Path
@@ -132,7 +149,6 @@ def resume(
         _measure_one(folder, number, jobs[number], measure, warm_up)
     records = _read_records(folder, settings, nouns)
     records += _take_in(folder, range(len(jobs)), jobs)  # of a call that was interrupted
-    records = [record for record in records if any(job.items() <= record.items() for job in jobs)]
     missing = [n for n, job in enumerate(jobs) if not any(job.items() <= record.items() for record in records)]
     if missing and (hand_out := HAND_OUT.get()) is not None:
         hand_out(folder, missing)

@@ -1,4 +1,4 @@
-"""What the claims about exposures and poses share: three trainings of a synthetic scene, with a known disturbance."""
+"""Recovery from a known disturbance of exposures or poses: three trainings of a synthetic scene."""
 
 import argparse
 from typing import Any

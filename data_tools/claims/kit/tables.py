@@ -68,4 +68,4 @@ def table(records: Iterable[Record], keys: Mapping[str, str], columns: Columns) 
 
 
 def _name(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)

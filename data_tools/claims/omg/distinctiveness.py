@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.detail import Quality, quality
-from data_tools.claims.kit.figures import plot_deviations, set_ticks, with_deviation
+from data_tools.claims.kit.figures import plot_deviations, set_ticks, subplots, with_deviation
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
@@ -44,26 +45,27 @@ def run(args: argparse.Namespace) -> kit.Report:
     settings = {**kit.describe_scene(scene), **kit.settings_of(args, "recipe", "iterations", "fine_tune")}
     settings |= {"power": POWER} | ({} if args.ply is None else {"ply": str(args.ply)})
 
-    def measure_seed(seed: int) -> list[dict[str, Any]]:
+    def measure_seed(seed: int) -> dict[str, Any]:
         recipe = get_recipe(args.recipe, args.iterations)
         whole = load_ply(args.ply) if args.ply else kit.train_with_progress(scene, recipe, seed).gaussians
-        return [{"rows": measure(whole, scene, args.fine_tune, seed), "losses": losses_of_fields(whole, scene)}]
+        return {"rows": measure(whole, scene, args.fine_tune, seed), "losses": losses_of_fields(whole, scene)}
 
-    jobs = [{"seed": seed} for seed in args.seeds]
-    records = [record for record in kit.resume(args.out, settings, jobs, measure_seed) if record["seed"] in args.seeds]
+    records = kit.resume(args.out, settings, kit.jobs_of(seed=args.seeds), measure_seed)
     records.sort(key=lambda record: record["seed"])
     runs = [record["rows"] for record in records]
     losses = {field: [record["losses"][field] for record in records] for field in records[0]["losses"]}
     result = {**settings, "seeds": list(args.seeds), "runs": runs, "losses": losses}
     text = f"{kit.title(settings)}; {kit.seeds_of(args)}; fine-tuned {args.fine_tune} iterations\n\n"
-    text += markdown_table(["kept", "by", "Gaussians", *COLUMNS], to_rows(runs))
+    columns = [(name, spread(value, digits)) for name, (value, digits) in COLUMNS.items()]
+    rows = [row for run in runs for row in run]
+    text += table(rows, {"kept": "kept", "choice": "by"}, [("Gaussians", mean("n_gaussians")), *columns])
     text += "\n\ndB lost by one field from the file, at each level\n\n"
-    rows = [
+    lost = [
         [field, *(with_deviation(of_seeds, 2) for of_seeds in zip(*of_levels, strict=True))]
         for field, of_levels in losses.items()
     ]
-    text += markdown_table(["field", *map(str, range(len(OMG_FILE.levels)))], rows)
-    arms = kit.arms_of([row for rows in runs for row in rows if row["choice"]], "choice", ("at_once", "tuned"))
+    text += markdown_table(["field", *map(str, range(len(OMG_FILE.levels)))], lost)
+    arms = kit.arms_of([row for row in rows if row["choice"]], "choice", ("at_once", "tuned"))
     return kit.Report(result, draw(result), text, arms)
 
 
@@ -121,21 +123,10 @@ COLUMNS: dict[str, tuple[Callable[[dict[str, Any]], float], int]] = {
 """Measures of a row of the results, and their digits in the table."""
 
 
-def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
-    """Return the lines of the table: means and deviations over the seeds."""
-    lines = []
-    for rows in zip(*runs, strict=True):
-        cells = [with_deviation([value(row) for row in rows], digits) for value, digits in COLUMNS.values()]
-        n = np.mean([row["n_gaussians"] for row in rows])
-        lines.append([rows[0]["kept"], rows[0]["choice"], f"{n:,.0f}", *cells])
-    return lines
-
-
 def draw(result: dict[str, Any]) -> Figure:
     """Draw PSNR against the fraction kept, the gain of distinctiveness in either half, and PSNR against bytes."""
     runs = result["runs"]
-    figure = Figure(figsize=(12.0, 3.6), layout="constrained")
-    kept, halves, size = figure.subplots(1, 3)
+    figure, (kept, halves, size) = subplots((12.0, 3.6), 1, 3)
     for choice, color in COLORS.items():
         for column, style in (("fine-tuned", "-o"), ("at once", ":o")):
             values = _by_seed(runs, choice, column)

@@ -13,13 +13,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import with_deviation
+from data_tools.claims.kit.figures import subplots, with_deviation
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.extensions.extension import all_formats, find_recipe
 from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.method import OMG
 from minisplat_ref.extensions.omg.pack import read_training
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
@@ -27,6 +27,12 @@ from minisplat_ref.training.representation import WORLD_UNITS
 from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, Scene
 
 TRAINED, RESULT = ".omg of the training", "as trained"
+COLUMNS = (
+    ("bytes", spread("n_bytes", 0)),
+    ("bytes per Gaussian", spread(lambda row: row["n_bytes"] / max(1, row["gaussians"]), 1)),
+    ("PSNR (dB)", spread("psnr", 2)),
+    ("lost (dB)", spread("lost", 2)),
+)
 COLORS = {".msz": BLUE, ".spz": GREY, ".omg": OCHRE, TRAINED: RED}
 
 
@@ -35,13 +41,14 @@ def run(args: argparse.Namespace) -> kit.Report:
     scene = kit.read_scene(args.scene, args.downscale)
     runs: list[dict[str, Any]] = []
     for name, (model, frame) in _trainings(args, scene):
-        rows = kit.with_progress(_rows(model, frame, scene), f"files, {name}")
-        runs.append({"training": name, "gaussians": len(model.gaussians.means), "rows": list(rows)})
+        measured = list(kit.with_progress(_rows(model, frame, scene), f"files, {name}"))
+        runs.append({"training": name, "gaussians": len(model.gaussians.means), "rows": measured})
     origin = {"checkpoints": [str(path) for path in args.checkpoints]} if args.checkpoints else {"recipe": OMG.name}
     result = {**kit.describe_scene(scene), **origin, "iterations": args.iterations, "runs": runs}
     counts = with_deviation([float(of["gaussians"]) for of in runs], 0)
     text = f"{kit.title(result)}\n{counts} Gaussians\n\n"
-    text += markdown_table(["file", "bytes", "bytes per Gaussian", "PSNR (dB)", "lost (dB)"], _table(runs))
+    rows = [{**row, "gaussians": of["gaussians"]} for of in runs for row in of["rows"]]
+    text += table(rows, {"file": "file"}, COLUMNS)
     return kit.Report(result, draw(result), text)
 
 
@@ -77,24 +84,9 @@ def _rows(model: Model, frame: Frame, scene: Scene) -> Iterator[dict[str, Any]]:
         yield {"file": name, "n_bytes": len(content), "psnr": psnr, "lost": whole - psnr}
 
 
-def _table(runs: list[dict[str, Any]]) -> list[list[str]]:
-    """Return the lines of the table: means and deviations over the trainings."""
-    lines = []
-    for rows in zip(*(of["rows"] for of in runs), strict=True):
-        each = [row["n_bytes"] / max(1, of["gaussians"]) for row, of in zip(rows, runs, strict=True)]
-        measures = [
-            with_deviation([row["n_bytes"] for row in rows], 0),
-            with_deviation(each, 1),
-            *(with_deviation([row[name] for row in rows], 2) for name in ("psnr", "lost")),
-        ]
-        lines.append([rows[0]["file"], *measures])
-    return lines
-
-
 def draw(result: dict[str, Any]) -> Figure:
     """Draw PSNR against bytes, the mean over the trainings, of each format through its levels."""
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((6.4, 4.0))
     by_file = list(zip(*(of["rows"] for of in result["runs"]), strict=True))
     for kind, color in COLORS.items():
         own = [rows for rows in by_file if rows[0]["file"].rpartition(" ")[0] == kind or rows[0]["file"] == kind]

@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import set_ticks, show, table_of
+from data_tools.claims.kit.figures import set_ticks, show, subplots, table_of
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.polygons.kernels import TRIANGLE, Fans, tree_of
 from minisplat_ref.extensions.polygons.method import TRACED
@@ -217,8 +217,7 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 def draw(result: dict[str, Any]) -> Figure:
     """Draw a bent sheet, as polygons and as Gaussians, beside both curves."""
-    figure = Figure(figsize=(10.5, 2.9), layout="constrained")
-    panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1, 1, 1.4, 1.4]})
+    figure, panels = subplots((10.5, 2.9), 1, 4, gridspec_kw={"width_ratios": [1, 1, 1.4, 1.4]})
     gaussians, angle = sheet(USUAL_PER_SIDE), 180
     soup = soup_of(gaussians, 8)
     corners = place_sheet(bend(soup.corners, angle))

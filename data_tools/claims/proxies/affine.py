@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import set_ticks, show, table_of
+from data_tools.claims.kit.figures import set_ticks, show, subplots, table_of
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, rotation_about
 from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
@@ -217,8 +217,7 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 def draw(bend: dict[str, Any], seed: int) -> Figure:
     """Draw a sheet, an edit of its middle, the rolled sheet, and the errors of rolling."""
-    figure = Figure(figsize=(9.0, 2.6), layout="constrained")
-    panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1, 1, 1, 1.5]})
+    figure, panels = subplots((9.0, 2.6), 1, 4, gridspec_kw={"width_ratios": [1, 1, 1, 1.5]})
     sheet, centre = flat_gaussians(np.random.default_rng(seed)), np.zeros(3)
     raised = about_point(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
     images = {

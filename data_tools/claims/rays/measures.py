@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import show, table_of
+from data_tools.claims.kit.figures import show, subplots, table_of
 from data_tools.claims.rays import demo
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.rays.kernels import tree_of
@@ -174,8 +174,7 @@ def draw(errors: dict[str, list[float]]) -> Figure:
     """Draw the demo scene beside the errors of splatting."""
     camera = demo.camera_of()
     image = shade(demo.demo_world(), pixel_rays(camera, GSPLAT_MAIN)).reshape(camera.height, camera.width, 3)
-    figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = subplots((9.5, 3.6), 1, 2)
     show(left, image)
     for (name, values), color in zip(errors.items(), (BLUE, OCHRE, RED), strict=True):
         right.loglog(SIGMAS, values, "o-", ms=4, color=color, label=f"{name} off the axis")

@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import show, with_deviation
+from data_tools.claims.kit.figures import group, show, subplots, with_deviation
+from data_tools.claims.kit.tables import spread, table
 from data_tools.claims.satellite.boxes import HIGH, SCALE, SIZE, Truth, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite.affine_fit import fit_residual
@@ -31,6 +32,11 @@ ARMS = (
     "means at the rate of 3DGS",
     "a black background",
     "limits 8 m below the ground",
+)
+COLUMNS = (
+    ("height MAE (m)", spread("height_mae", 2)),
+    ("shadow IoU", spread("shadow_iou", 2)),
+    ("gain error", spread("gain_error", 3)),
 )
 PLANE, BELOW = "a plane", 8.0  # metres
 N_POINTS = 10_000
@@ -88,45 +94,32 @@ def measure(model: Model, truth: Truth) -> tuple[Measured, Floats]:
 def run_boxes(args: argparse.Namespace) -> kit.Report:
     """Train every arm with every seed, which is also that of the scene; what is in ``--out`` already is kept."""
     settings = kit.settings_of(args, "iterations")
-    jobs = [{"seed": seed, "arm": arm} for seed in range(args.seeds) for arm in ARMS]
 
-    def measure_job(seed: int, arm: str) -> list[dict[str, Any]]:
+    def measure_job(seed: int, arm: str) -> dict[str, Any]:
         truth = make_scene(seed, N_POINTS, below=BELOW if arm == ARMS[-1] else 0.0)
         recipe, scene = arm_of(arm, find_recipe("satellite", args.iterations), truth.scene)
         # Photographs without a sun in their cameras have no shadows; the truth's masks still do.
         measured, heights = measure(train(scene, recipe, seed=seed).model, truth._replace(scene=scene))
         if seed == 0:
             np.save(args.out / f"{arm}.npy", heights.astype(np.float32))
-        return [measured._asdict()]
+        return measured._asdict()
 
-    records = [record for record in kit.resume(args.out, settings, jobs, measure_job) if record["seed"] < args.seeds]
-    arms = kit.arms_of(records, "arm", Measured._fields)
-    planes = []
-    for seed in range(args.seeds):
-        heights = make_scene(seed).heights
-        planes.append({"seed": seed, "arm": PLANE, "height_mae": float(np.abs(heights - np.median(heights)).mean())})
-    records += planes
+    records = kit.resume(args.out, settings, kit.jobs_of(seed=range(args.seeds), arm=ARMS), measure_job)
+    arms, text = kit.arms_of(records, "arm", Measured._fields), to_table(records)
+    heights = [make_scene(seed).heights for seed in range(args.seeds)]
+    planes = [float(np.abs(of_seed - np.median(of_seed)).mean()) for of_seed in heights]
+    records += [{"seed": seed, "arm": PLANE, "height_mae": mae} for seed, mae in enumerate(planes)]
+    text += f"\n\na plane at the median height has an MAE of {with_deviation(planes, 2)} m"
     shown = {"truth": make_scene(0).heights, **{arm: np.load(args.out / f"{arm}.npy") for arm in ARMS}}
     shown[ARMS[-1]] = shown[ARMS[-1]] - BELOW
-    return kit.Report({**settings, "seeds": args.seeds, "records": records}, draw(shown), table(records), arms)
+    return kit.Report({**settings, "seeds": args.seeds, "records": records}, draw(shown), text, arms)
 
 
-def table(records: list[dict[str, Any]]) -> str:
+def to_table(records: list[dict[str, Any]]) -> str:
     """Return the table, the least favourable arm first."""
-
-    def of(arm: str, key: str, digits: int) -> str:
-        return with_deviation([r[key] for r in records if r["arm"] == arm and key in r], digits)
-
-    def mae(arm: str) -> float:
-        return -float(np.mean([r["height_mae"] for r in records if r["arm"] == arm]))
-
-    rows = [
-        [arm, of(arm, "height_mae", 2), of(arm, "shadow_iou", 2), of(arm, "gain_error", 3)]
-        for arm in sorted(ARMS, key=mae)
-    ]
-    heading = ["", "height MAE (m)", "shadow IoU", "gain error"]
-    plane = of(PLANE, "height_mae", 2)
-    return f"{markdown_table(heading, rows)}\n\na plane at the median height has an MAE of {plane} m"
+    maes = {arm: float(np.mean([record["height_mae"] for record in own])) for arm, own in group(records, "arm").items()}
+    by_error = sorted(records, key=lambda record: (-maes[record["arm"]], ARMS.index(record["arm"])))
+    return table(by_error, {"arm": ""}, COLUMNS)
 
 
 def draw(shown: dict[str, Floats]) -> Figure:
@@ -149,8 +142,7 @@ def run_distance(args: argparse.Namespace) -> kit.Report:
     ]
     rows = [[f"{r['distance'] / 1e3:g}", f"{r['off_nadir']:g}", f"{r['residual']:.2f}"] for r in records]
     text = markdown_table(["distance (km)", "off nadir (degrees)", "largest residual (px)"], rows)
-    figure = Figure(figsize=(4, 3), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots((4, 3))
     for angle in OFF_NADIR:
         chosen = [r for r in records if r["off_nadir"] == angle]
         ax.loglog([r["distance"] for r in chosen], [r["residual"] for r in chosen], "o-", label=f"{angle:g} degrees")

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
+from data_tools.claims.kit.figures import subplots
 from data_tools.claims.vr import queues
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
@@ -123,8 +124,7 @@ def run_foveation(args: argparse.Namespace) -> kit.Report:
 
 def draw_foveated(rows: list[dict[str, Any]]) -> Figure:
     """Draw the weighted PSNR against the number of rays."""
-    figure = Figure(figsize=(6.5, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((6.5, 4))
     work = [100 * row["n_samples"] / rows[0]["n_samples"] for row in rows]
     axes.plot(work, [row["weighted_psnr"] for row in rows], "o", color=COLORS[2], label="weighted by acuity")
     axes.plot(work, [row["psnr"] for row in rows], "o", color=COLORS[0], label="unweighted")
@@ -180,8 +180,7 @@ def run_yaw(args: argparse.Namespace) -> kit.Report:
 
 def draw_yaw(found: dict[str, list[float]], half_angle: float) -> Figure:
     """Draw the largest change in each step."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((8, 4))
     for (method, steps), color in zip(found.items(), COLORS, strict=True):
         axes.semilogy(
             np.linspace(-half_angle, half_angle, len(steps)), np.maximum(steps, 1e-17), color=color, label=method
@@ -221,8 +220,7 @@ def run_queues(args: argparse.Namespace) -> kit.Report:
 
 def draw_orders(rows: list[dict[str, Any]]) -> Figure:
     """Draw the pairs in the wrong order against the work."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((8, 4))
     for i, row in enumerate(rows):
         x, y = (row["n_depths"] + row["n_steps"]) / row["n_hits"], row["n_wrong"] / max(row["n_pairs"], 1)
         axes.plot(x, y, "o", color=RED if row["order"] == queues.HIERARCHY.name else BLUE)

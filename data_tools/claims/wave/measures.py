@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import show, table_of
+from data_tools.claims.kit.figures import show, subplots, table_of
 from minisplat_ref.extensions.wave import blending, windows
 from minisplat_ref.extensions.wave.blending import Scene, front_to_back
 from minisplat_ref.extensions.wave.hologram import blend_fast
@@ -215,8 +215,7 @@ def edge_figures(image: Floats) -> dict[str, float]:
 
 def draw(stack: dict[str, Any], edges: dict[str, Floats]) -> Figure:
     """Draw the focal stack, and the wall behind a screen."""
-    figure = Figure(figsize=(10, 2.9), layout="constrained")
-    panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1.5, 1, 1, 1]})
+    figure, panels = subplots((10, 2.9), 1, 4, gridspec_kw={"width_ratios": [1.5, 1, 1, 1]})
     for at, peaks, color in zip(stack["at"], stack["peaks"], (BLUE, GREEN, RED), strict=True):
         panels[0].plot(1e3 * STACK, peaks, color=color, label=f"at {1e3 * at:+.0f}")
         panels[0].axvline(1e3 * at, color=color, lw=0.8, ls=":")

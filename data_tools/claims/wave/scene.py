@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import show, table_of
+from data_tools.claims.kit.figures import show, subplots, table_of
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.wave.focus import reconstruct
@@ -119,8 +119,7 @@ def _thirds(depth: Floats) -> dict[str, Any]:
 
 def draw(result: dict[str, Any], images: list[Floats]) -> Figure:
     """Draw the PSNR of each third over the focus, the rendering, and the hologram focused near and far."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    panels = figure.subplots(1, 5, gridspec_kw={"width_ratios": [1.6, 1, 1, 1, 1]})
+    figure, panels = subplots((11, 3.6), 1, 5, gridspec_kw={"width_ratios": [1.6, 1, 1, 1, 1]})
     for name, color in THIRDS.items():
         panels[0].plot(result["foci"], result["curves"][name], color=color, label=name)
         panels[0].axvline(result["thirds"][name]["depth"], color=color, lw=0.8, ls=":")

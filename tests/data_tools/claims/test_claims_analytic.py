@@ -1,18 +1,16 @@
 """The error of one Gaussian's footprint, as the docstring of the relative quotes it."""
 
-import json
-
 import pytest
 
 from data_tools.claims import analytic as footprint
 from data_tools.claims.__main__ import main as measure_claim
+from measured_claims import measured
 
 
 def test_the_claim_finds_what_the_docstring_says(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(footprint, "SIGMAS", (0.1, 1.0))
     out = tmp_path / "measured"
-    assert measure_claim(["analytic/footprint", "--out", str(out)]) == 0
-    errors = json.loads((out / "result.json").read_text())["errors"]
+    errors = measured(["analytic/footprint", "--out", str(out)])["errors"]
     assert errors["round"]["integral, logistic"][0] < 1e-3 < 0.1 < errors["round"]["Mip filter"][0]
     assert errors["round"]["dilation"][0] > 10 > errors["round"]["centre"][0] > 1
     assert 0.02 < errors["needle"]["integral, erf"][0] < 0.2

@@ -11,6 +11,7 @@ from data_tools.claims.gdgs import counts as gdgs_counts
 from data_tools.claims.kit import counts, detail
 from data_tools.claims.kit.counts import Curve
 from data_tools.claims.kit.detail import halves_of, quality
+from measured_claims import measured
 from minisplat_ref.app.cli import main
 from minisplat_ref.interface.palette import RED
 from minisplat_ref.metrics import ViewMetrics
@@ -96,8 +97,7 @@ def few(monkeypatch):
 def test_curves_of_counts_run_and_continue(few, tmp_path, capsys, monkeypatch):
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *TINY]) == 0
     command = ["gdgs/counts", str(tmp_path / "room"), "--iterations", "30", "--out", str(tmp_path / "s")]
-    assert measure_claim([*command, "--seeds", "1"]) == 0
-    first = json.loads((tmp_path / "s" / "result.json").read_text())
+    first = measured([*command, "--seeds", "1"])
     assert [r["curve"] for r in first["records"]] == ["3dgs-accel", "gdgs"]
     trained = []
     measure = counts.measure

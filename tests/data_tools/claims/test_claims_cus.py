@@ -1,16 +1,15 @@
 """CUS-GS: the teacher and counts of floats by hand, the tables, and small runs of both claims."""
 
-import json
 from functools import partial
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.cus import floats as claim
 from data_tools.claims.cus import growth as growth_claim
 from data_tools.claims.kit.objects import object_ids
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.cus import maps
 from minisplat_ref.extensions.cus.losses import read_memory
@@ -54,8 +53,7 @@ def test_the_claim_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(claim, "make_scene", lambda name, **size: small_room(name))
     monkeypatch.setattr(claim, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
     words = ["cus/floats", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert measure_claim(words) == 0
-    records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
+    records = measured(words)["records"]
     names = ["anchors, latent 2", "anchors, latent 3", "own queries, 1", "own queries, 3", "adaptive"]
     assert [r["arm"] for r in records] == names
     n = records[0]["gaussians"] // 2
@@ -75,8 +73,7 @@ def test_the_claim_of_growing_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(claim, "CUS", configure(find_recipe("cus"), **SMALL))
     monkeypatch.setattr(claim, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
     monkeypatch.setattr(growth_claim, "LATENT", SMALL["latent"])
-    assert measure_claim(["cus/growth", "--iterations", "230", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
-    records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
+    records = measured(["cus/growth", "--iterations", "230", "--seeds", "1", "--out", str(tmp_path / "s")])["records"]
     assert [r["arm"] for r in records] == [
         "90 points, without growing",
         "90 points, with growing",

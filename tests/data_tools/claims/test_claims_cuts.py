@@ -1,13 +1,12 @@
 """DisC-GS: the edge that is found, the card by hand, and small runs."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.cuts import card, edge
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
@@ -55,15 +54,13 @@ def test_the_claim(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(claim, "NUMBERS", {"plain": (1,), "cut": (1,)})
     out = tmp_path / "measured"
-    assert measure_claim(["cuts/card", "--iterations", "5", "--seeds", "2", "--out", str(out)]) == 0
-    assert len(json.loads((out / "result.json").read_text())["rows"]) == 4
+    assert len(measured(["cuts/card", "--iterations", "5", "--seeds", "2", "--out", str(out)])["rows"]) == 4
     assert (out / "figure.png").stat().st_size > 10_000 and "| cut Gaussian" in capsys.readouterr().out
     monkeypatch.setattr(edge, "NUMBERS", ((2,), (2,), (2,)))
     photographs = tmp_path / "photographs"
     write_scene(make_scene("room", supersampling=1, **SCENE | {"width": 56, "height": 50}), photographs, SCENE)
     options = ["--iterations", "4", "--seeds", "2", "--out", str(tmp_path / "edge")]
-    assert measure_claim(["cuts/edge", str(photographs), *options]) == 0
-    rows = json.loads((tmp_path / "edge" / "result.json").read_text())["rows"]
+    rows = measured(["cuts/edge", str(photographs), *options])["rows"]
     assert [row["n_floats"] for row in rows] == [28, 44, 60] and "| 2 curves" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
         measure_claim(["cuts/card", "--seeds", "0", "--out", str(tmp_path / "none")])

@@ -1,12 +1,11 @@
 """The claim ``defects``: what is planted is what the record says, and the table counts the records."""
 
-import json
-
 import numpy as np
 import pytest
 
 from data_tools.claims import defects
 from data_tools.claims.__main__ import main as measure_claim
+from measured_claims import measured
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -46,8 +45,7 @@ def test_command(tmp_path, capsys):
     options = ["--views", "9", "--width", "40", "--height", "30", "--supersampling", "1", "--points", "150"]
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *options]) == 0
     command = ["defects", str(tmp_path / "room"), "--trials", "1", "--out", str(tmp_path / "out")]
-    assert measure_claim(command) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    result = measured(command)
     assert [run["condition"] for run in result["runs"]] == ["clean", "gains", "poses", "sizes"]
     for run in result["runs"]:
         row = result["summary"][run["condition"]]
@@ -97,8 +95,7 @@ def test_sky_alone_is_asked_of_a_scene_that_is_synthetic(scene, tmp_path, capsys
         "--out",
         str(out),
     ]
-    assert measure_claim(command) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = measured(command)
     (run,) = result["runs"]
     assert list(run["evidence"]) == ["switch_sky_on"] and result["summary"]["clean"] == {"trials": 1, "sky": 0}
     assert "after 100 iterations" in capsys.readouterr().out

@@ -1,29 +1,16 @@
 """Fans: profiles in closed form, and small runs of both claims."""
 
-import json
-
 import numpy as np
 import pytest
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.fans.profile import fan_profile, mass, profile_error
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
+from measured_claims import measured, scene_folder  # noqa: F401  (a fixture)
 from minisplat_ref.extensions.fans.shapes import FanShape
 from minisplat_ref.io.ply import save_ply
 from scenes import as_dtype, make_gaussians
 from tolerances import PROFILE_GRID
 
 FLAT, SOLID = FanShape(8, 2.5, 0.2), FanShape(8, 2.3, 0.1, is_flat=False)
-
-SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
-
-
-@pytest.fixture(scope="module")
-def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +38,11 @@ def test_the_claims(scene_folder, model, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("data_tools.claims.fans.profile.ANGLES", (0, 90))
     refit, profile = tmp_path / "refit", tmp_path / "profile"
     options = ["--ply", str(model), "--fine-tune", "3", "--out", str(refit)]
-    assert measure_claim(["fans/refit", str(scene_folder), *options]) == 0
-    (run,) = json.loads((refit / "result.json").read_text())["runs"]
+    (run,) = measured(["fans/refit", str(scene_folder), *options])["runs"]
     assert [row["form"] for row in run["rows"] if "triangles" in row][::3] == ["flat fans", "solid fans"]
     assert (refit / "figure.png").stat().st_size > 10_000 and "| flat fans, vertices" in capsys.readouterr().out
     assert sorted(path.name for path in refit.iterdir()) == ["figure.png", "result.json"]
-    assert measure_claim(["fans/profile", "--out", str(profile)]) == 0
-    tilts = json.loads((profile / "result.json").read_text())["tilts"]
+    tilts = measured(["fans/profile", "--out", str(profile)])["tilts"]
     edge_on = {(tilt["kind"], tilt["is_flat"]): tilt["errors"][1] for tilt in tilts}
     assert edge_on["ball", True] > 0.99 > edge_on["ball", False]
     assert "| 8     | 2.50  | 0.00 | 12.3%     | 0.94 |" in capsys.readouterr().out

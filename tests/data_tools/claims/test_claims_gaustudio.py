@@ -1,12 +1,11 @@
 """GauStudio: the sky and the swaps on a small scene, and what is measured where."""
 
-import json
-
 import numpy as np
 import pytest
 
 from data_tools.claims import gaustudio as claim
 from data_tools.claims.__main__ import main as measure_claim
+from measured_claims import measured
 from minisplat_ref.app.cli import main
 from minisplat_ref.extensions.gaustudio import modules
 from minisplat_ref.extensions.gaustudio.modules import STAGES
@@ -25,8 +24,7 @@ def folder(tmp_path_factory):
 def test_the_claim_of_the_sky(folder, tmp_path, capsys):
     arms = ["--arms", "without,ball+loss", "--iterations", "60", "--seeds", "0"]
     scene, masks = str(folder / "scene"), ["--masks", str(folder / "masks")]
-    assert measure_claim(["gaustudio/sky", scene, *masks, *arms, "--out", str(tmp_path / "sky")]) == 0
-    without, both = json.loads((tmp_path / "sky" / "result.json").read_text())["records"]
+    without, both = measured(["gaustudio/sky", scene, *masks, *arms, "--out", str(tmp_path / "sky")])["records"]
     assert both["opacity"] < 0.8 * without["opacity"] and both["psnr_sky"] > without["psnr_sky"]
     assert both["opacity"] < both["opacity_scene"] <= 1
     assert "| ball+loss" in capsys.readouterr().out
@@ -36,8 +34,7 @@ def test_the_claim_of_the_sky(folder, tmp_path, capsys):
 
 def test_the_claim_of_swaps(folder, tmp_path, capsys):
     options = ["--stages", "photo_loss", "--iterations", "5", "--seeds", "0", "--out", str(tmp_path / "swaps")]
-    assert measure_claim(["gaustudio/swaps", str(folder / "scene"), *options]) == 0
-    records = json.loads((tmp_path / "swaps" / "result.json").read_text())["records"]
+    records = measured(["gaustudio/swaps", str(folder / "scene"), *options])["records"]
     assert [record["arm"] for record in records] == ["as it is", "photo_loss=l1", "photo_loss=squared"]
     assert set(claim.SWAPPED) == STAGES.keys() - {"sky_mask"}
     assert len(claim.swaps(claim.SWAPPED)) == 1 + sum(

@@ -1,8 +1,6 @@
 """Depth under each loss, on a small scene."""
 
-import json
-
-from data_tools.claims.__main__ import main as measure_claim
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 
 
@@ -11,7 +9,6 @@ def test_the_claim_measures_depths(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("data_tools.claims.geometry.make_scene", lambda name: make_scene(name, **tiny))
     out = tmp_path / "measured"
     options = ["--iterations", "120", "--seeds", "1", "--out", str(out)]
-    assert measure_claim(["geometry/depth", "room", *options]) == 0
-    records = {r["arm"]: r for r in json.loads((out / "result.json").read_text())["records"]}
+    records = {r["arm"]: r for r in measured(["geometry/depth", "room", *options])["records"]}
     assert records["sfm_depth"]["median_error"] < records["without"]["median_error"] < 0.5
     assert (out / "figure.png").stat().st_size > 10_000 and "| all three" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What did not act is refused, not reported: two arms of a claim that agree in every digit."""
+"""A mechanism that did not act is refused, not reported: two arms of a claim that agree in every digit."""
 
 import argparse
 

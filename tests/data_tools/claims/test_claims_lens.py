@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.lens import fisheye, footprints
 from data_tools.claims.lens.fisheye import rays_of, take_photographs
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.mechanisms.cameras.models import model_of
@@ -43,8 +44,7 @@ def test_small_balls_are_drawn_by_every_footprint(kind, edge):
 
 def test_the_claim_of_footprints(tmp_path):
     """On a small set: EWA and the unscented conic err more off the axis, and the exact response hardly."""
-    assert measure_claim(["lens/footprints", "--gaussians", "2", "--out", str(tmp_path)]) == 0
-    for errors in json.loads((tmp_path / "result.json").read_text())["errors"].values():
+    for errors in measured(["lens/footprints", "--gaussians", "2", "--out", str(tmp_path)])["errors"].values():
         assert errors["EWA"][-1] > errors["EWA"][0] > errors["UT"][0] > 0.02
         assert max(errors["exact"]) < 0.05  # what the bounds leave out
         assert max(errors["bounds"]) < max(errors["exact"])  # the rest is below alpha_min
@@ -91,8 +91,7 @@ def test_what_undistortion_keeps(photographs):
 def test_the_claim_of_the_fisheye(tmp_path, capsys):
     """At a tiny size; the arms have equal numbers of Gaussians, and the folder resumes without another training."""
     out = ["lens/fisheye", "--width", "24", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert measure_claim(out) == 0
-    result = json.loads((tmp_path / "s" / "result.json").read_text())
+    result = measured(out)
     assert len(result["records"]) == 3 and len({record["gaussians"] for record in result["records"]}) == 1
     assert len({record["border"] for record in result["records"]}) == 3
     capsys.readouterr()

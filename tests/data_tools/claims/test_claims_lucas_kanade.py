@@ -1,13 +1,12 @@
 """Lucas-Kanade: the body that turns and grows, by hand, and small runs of both claims."""
 
-import json
-
 import numpy as np
 from numpy.testing import assert_allclose
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.lucas_kanade import body as bodies
 from data_tools.claims.lucas_kanade import trainings as claim
+from measured_claims import measured
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import activate
 
@@ -39,8 +38,12 @@ def test_the_claim_measures_its_arms(monkeypatch, tmp_path, capsys):
     for name, value in (("WIDTH", 48), ("HEIGHT", 32), ("FOCAL", 55.0)):
         monkeypatch.setattr(bodies, name, value)
     out = tmp_path / "out"
-    assert measure_claim(["lucas-kanade/body", "--iterations", "30", "--seeds", "0", "--out", str(out)]) == 0
-    records = {record["arm"]: record for record in json.loads((out / "result.json").read_text())["records"]}
+    records = {
+        record["arm"]: record
+        for record in measured(["lucas-kanade/body", "--iterations", "30", "--seeds", "0", "--out", str(out)])[
+            "records"
+        ]
+    }
     assert list(records) == [f"{camera}, {arm}" for camera in claim.CAMERAS for arm in claim.LOSSES]
     for camera in claim.CAMERAS:
         without, _, true = (records[f"{camera}, {arm}"] for arm in claim.LOSSES)

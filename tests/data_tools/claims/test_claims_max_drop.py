@@ -1,4 +1,4 @@
-"""What ``simplify --max-drop`` promises: through the command line, and its rows, made by hand."""
+"""The promise of ``simplify --max-drop``: through the command line, and its rows, made by hand."""
 
 import json
 

@@ -1,7 +1,5 @@
 """MP-GS: targets and floats by hand, and small runs of all claims."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,6 +7,7 @@ from numpy.testing import assert_allclose
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.kit import psnr_of
 from data_tools.claims.mixed import fit
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.types import Gaussians
@@ -48,8 +47,7 @@ def test_the_claims_of_images(name, n_images, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(claim.NUMBERS, name, {1: (1,), 2: (1,), 3: (1,)})
     monkeypatch.setitem(claim.SHOWN, name, {1: 1, 2: 1, 3: 1})
     out = tmp_path / "measured"
-    assert measure_claim([f"mixed/{name}", "--iterations", "3", "--seeds", "2", "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = measured([f"mixed/{name}", "--iterations", "3", "--seeds", "2", "--out", str(out)])
     assert len(result["rows"]) == len(result["needed"]) == 3 * n_images
     assert (out / "figure.png").stat().st_size > 10_000 and "| triangles" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
@@ -60,8 +58,7 @@ def test_the_claims_of_images(name, n_images, tmp_path, monkeypatch, capsys):
 def test_the_claim_of_scenes(tmp_path, capsys):
     write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
     options = ["--downscale", "1", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "measured")]
-    assert measure_claim(["mixed/scene", str(tmp_path / "nook"), *options]) == 0
-    whole, equal, groups_alone, mixed = json.loads((tmp_path / "measured" / "result.json").read_text())["rows"]
+    whole, equal, groups_alone, mixed = measured(["mixed/scene", str(tmp_path / "nook"), *options])["rows"]
     assert whole["n_floats"] > mixed["n_floats"] >= equal["n_floats"] > 0.95 * mixed["n_floats"]
     assert groups_alone["number"] == mixed["number"] == sum(mixed["kinds"]) and mixed["kinds"][1] > 0
     assert "mixed" in capsys.readouterr().out

@@ -1,10 +1,9 @@
 """Levels at every size, on a small scene."""
 
-import json
-
 import pytest
 
 from data_tools.claims.__main__ import main as measure_claim
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 
@@ -21,8 +20,7 @@ def scene_folder(tmp_path_factory):
 def test_the_claim_compares_at_every_size(scene_folder, tmp_path, capsys):
     out = tmp_path / "measured"
     options = [str(scene_folder), "--iterations", "40", "--seeds", "1", "--out", str(out)]
-    assert measure_claim(["multi-scale/downscale", *options]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = measured(["multi-scale/downscale", *options])
     assert result["blocks"] == [1, 2, 4, 8]
     pairs = {name: figures["n_pairs"][0] for name, figures in result["figures"].items()}
     assert pairs["levels 2"][-1] < pairs["3dgs"][-1]

@@ -7,6 +7,7 @@ import pytest
 
 from compact import short_run
 from data_tools.claims.__main__ import main as measure_claim
+from measured_claims import measured
 from minisplat_ref import load_ply, load_scene, save_ply
 from minisplat_ref.extensions.omg import file as omg
 from minisplat_ref.extensions.omg import trained_file
@@ -29,8 +30,7 @@ def test_claim_of_files(folders, tmp_path, capsys):
     nook, run = folders
     checkpoint = run / "checkpoint.npz"
     command = ["omg/files", str(nook), "--checkpoints", str(checkpoint), "--out", str(tmp_path / "out")]
-    assert measure_claim(command) == 0
-    (record,) = json.loads((tmp_path / "out" / "result.json").read_text())["runs"]
+    (record,) = measured(command)["runs"]
     rows = {row["file"]: row for row in record["rows"]}
     assert rows["as trained"]["lost"] == 0 and {".spz 0", ".msz 0", ".omg 4", ".omg of the training"} < set(rows)
     assert rows[".omg of the training"]["n_bytes"] == len(trained_file.encode(*read_training(checkpoint)))
@@ -48,8 +48,7 @@ def test_claim(folders, tmp_path, capsys):
     assert "'with distinctiveness' measured exactly what 'importance' did" in capsys.readouterr().err
     save_ply(tmp_path / "more.ply", initial_state(load_scene(nook), get_recipe("3dgs"), seed=0).gaussians)
     more = [*command, str(tmp_path / "more.ply"), "--out", str(tmp_path / "out")]
-    assert measure_claim(more) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    result = measured(more)
     rows = result["runs"][0]
     assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]
     counts = [row["n_gaussians"] for row in rows]

@@ -1,13 +1,12 @@
 """Polygon soups: affine and bent edits by hand, and small runs of both claims."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.polygons import edits as claims
+from measured_claims import measured
 from minisplat_ref.extensions.polygons.soup import carry_gaussians, soup_of
 from minisplat_ref.mechanisms.meshes.fans import flatten
 from scenes import make_gaussians
@@ -66,8 +65,7 @@ def test_the_claims_draw_and_print(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(claims, "ANGLES", (10, 20))
     monkeypatch.setattr(claims, "PER_SIDE", (4, 8))
     out = tmp_path / "measured"
-    assert measure_claim(["polygons/edits", "--seeds", "1", "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = measured(["polygons/edits", "--seeds", "1", "--out", str(out)])
     assert max(result["round trip"].values()) < PARITY_FLOAT64
     for name, errors in result["affine"].items():
         assert errors["covariance, fit"] < AFFINE_EDIT and errors["image"] < EDITED_IMAGE, name

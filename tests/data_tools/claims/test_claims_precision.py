@@ -1,7 +1,5 @@
 """The claim ``precision``: every training really has the precision that its row names."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -9,6 +7,7 @@ from numpy.testing import assert_array_equal
 from data_tools.claims import precision
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.precision import FAST, PRECISIONS, STORED, n_bytes, train_in_precision
+from measured_claims import measured
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
@@ -71,8 +70,7 @@ def test_command(tmp_path, capsys):
     scene = ["--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "120"]
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *scene]) == 0
     options = ["--iterations", "10", "--recipe", "3dgs-accel", "--seeds", "0,1", "--out", str(tmp_path / "out")]
-    assert measure_claim(["precision", str(tmp_path / "room"), *options]) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    result = measured(["precision", str(tmp_path / "room"), *options])
     assert len(result["runs"]) == 2 * 5 and list(result["summary"]) == [*PRECISIONS, STORED]
     by_hand = [
         run["psnr"] - fast["psnr"]

@@ -1,7 +1,5 @@
 """Proxies: the hanging and the swinging sheet, the derivative of the roll, and small runs of both claims."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -10,6 +8,7 @@ from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.proxies import affine as edit_claims
 from data_tools.claims.proxies import sheet as sheet_claims
 from data_tools.claims.proxies.affine import roll, rolled_jacobian
+from measured_claims import measured
 from minisplat_ref.io.images import read_image
 from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, VERLET_SLOPE
 
@@ -40,8 +39,7 @@ def test_the_derivative_of_the_cylinder(rng):
 
 
 def test_the_claim_of_edits(tmp_path, capsys):
-    assert measure_claim(["proxies/affine", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    result = measured(["proxies/affine", "--seeds", "1", "--out", str(tmp_path / "out")])
     for errors in result["edits"].values():
         assert 0 < errors["centre"] < 1e-12 and 0 < errors["covariance"] < 1e-12 and 0 < errors["color"] < 1e-12
     assert 0 < result["edits"]["rotation"]["image"] < 1e-10 and result["edits"]["shear"]["image"] is None
@@ -58,8 +56,7 @@ def test_the_claim_of_sheets(tmp_path, capsys, monkeypatch):
     small |= {"SETTLING": 0.5, "SWING_CELLS": 4, "SAMPLES": 8}
     for name, value in small.items():
         monkeypatch.setattr(sheet_claims, name, value)
-    assert measure_claim(["proxies/sheet", "--out", str(tmp_path / "out")]) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    result = measured(["proxies/sheet", "--out", str(tmp_path / "out")])
     assert 0 < result["free_fall"]["centre"] < 1e-12 and result["free_fall"]["covariance"] < 1e-12
     assert set(result["hanging"]) == {"0.01", "0.001"} and set(result["energy"]) == set(sheet_claims.SWINGS)
     assert "free fall for 1 s" in capsys.readouterr().out

@@ -1,6 +1,5 @@
 """Rays: splatting on the axis, the edge of a shadow, and small runs of both claims."""
 
-import json
 import re
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.rays import measures as claims
+from measured_claims import measured
 from tolerances import PARITY_FLOAT32_IMAGE, RAY_ORDER
 
 
@@ -31,8 +31,7 @@ def test_the_edge_of_a_shadow_is_where_the_tangent_cone_meets_the_floor():
 
 def test_the_claim_draws_and_prints(tmp_path, capsys):
     out = tmp_path / "measured"
-    assert measure_claim(["rays/claims", "--gaussians", "60", "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = measured(["rays/claims", "--gaussians", "60", "--out", str(out)])
     for name in ("tree against brute force", "tracing against exact order", "mirror against mirrored camera"):
         assert result[name] < RAY_ORDER
     errors = result["splatting against tracing"]["errors"]

@@ -1,24 +1,12 @@
 """Textures at the limb, and small runs of both claims."""
 
-import json
-
 import numpy as np
 import pytest
 
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.textured import colors_across
+from measured_claims import measured, scene_folder  # noqa: F401  (a fixture)
 from minisplat_ref.app.cli import main
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
-
-SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
-
-
-@pytest.fixture(scope="module")
-def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +27,7 @@ def test_a_texture_does_not_jump_at_the_limb():
 def test_the_claims(scene_folder, run_folder, tmp_path, capsys):
     out, ply = tmp_path / "measured", str(run_folder / "point_cloud.ply")
     options = ["--ply", ply, "--fine-tune", "3", "--out", str(out)]
-    assert measure_claim(["textured/counts", str(scene_folder), *options]) == 0
-    (rows,) = json.loads((out / "result.json").read_text())["runs"]
+    (rows,) = measured(["textured/counts", str(scene_folder), *options])["runs"]
     assert [row["form"] for row in rows].count("textures for view") == 4
     fewer = [row["n_floats"] for row in rows if row["kept"] == "as many floats"]
     assert len(fewer) == 2 and max(fewer) <= rows[0]["n_floats"]

@@ -1,14 +1,12 @@
 """VDGS: Schlick's formula, the pane and equal floats, on small scenes."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.vdgs import floats as floats_claim
 from data_tools.claims.vdgs import pane as claim
+from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
 from tolerances import CLOSED_FORM
 
@@ -24,8 +22,7 @@ def test_schlick_by_hand():
 
 def test_the_pane(tmp_path):
     arguments = ["vdgs/pane", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "pane")]
-    assert measure_claim(arguments) == 0
-    result = json.loads((tmp_path / "pane" / "result.json").read_text())
+    result = measured(arguments)
     assert [record["arm"] for record in result["records"]] == [claim.HARMONICS, claim.TIMES, claim.PLUS]
     truth = claim.make_pane(np.random.default_rng(0))
     front = claim.make_pane_scene(truth).train_views[23].camera

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.wave import measures as claims
+from measured_claims import measured
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.label import Label
@@ -57,8 +57,7 @@ def test_each_gaussian_is_sharpest_in_its_own_plane():
 
 
 def test_the_claim_measures_its_claims(tmp_path, capsys):
-    assert measure_claim(["wave/claims", "--gaussians", "4", "--out", str(tmp_path / "measured")]) == 0
-    result = json.loads((tmp_path / "measured" / "result.json").read_text())
+    result = measured(["wave/claims", "--gaussians", "4", "--out", str(tmp_path / "measured")])
     cost, edge = result["cost"], result["edge"]
     assert (
         cost["point cloud"]["waves"] > 10 * cost["exact, whole grid"]["waves"] > 100 * cost["exact, windows"]["waves"]
@@ -70,8 +69,7 @@ def test_the_claim_measures_its_claims(tmp_path, capsys):
 
 def test_a_trained_scene_is_best_where_it_is_in_focus(run, tmp_path, capsys):
     ply, out = run / "point_cloud.ply", tmp_path / "measured"
-    assert measure_claim(["wave/scene", str(ply), "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = measured(["wave/scene", str(ply), "--out", str(out)])
     thirds = result["thirds"]
     assert thirds["near"]["depth"] < thirds["middle"]["depth"] < thirds["far"]["depth"]
     assert thirds["near"]["best focus"] < thirds["far"]["best focus"]
