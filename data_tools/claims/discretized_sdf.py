@@ -18,14 +18,13 @@ import numpy as np
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, seeds
-from data_tools.claims.kit.figures import show, subplots, with_deviation
+from data_tools.claims.kit.figures import show, subplots
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.discretized_sdf.losses import projection
 from minisplat_ref.extensions.discretized_sdf.population import WIDTH, SDFSurfels, facing, with_distances
 from minisplat_ref.extensions.discretized_sdf.reference import opacity_logits, projected, reference_sharpness
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
@@ -47,6 +46,13 @@ ARMS = ("by distance, gamma by the median", "by distance, first gamma", "as at t
 N_POINTS, NOISE = 400, 0.03  # where the training of the glossy sphere starts
 ROUGHNESS = 0.3
 RECIPES = ("discretized-sdf", "reflective")
+SPHERE = (
+    ("radius error of x_0", spread("radius_error", 4)),
+    ("std of s - true s", spread("consistency", 4)),
+    ("depth bias", spread("depth_bias", 4)),
+    ("|depth error|", spread("depth_error", 4)),
+    ("ds/dn", spread("slope", 2)),
+)
 RELIT = (
     ("RMS error of albedo", spread("albedo_error", 3)),
     ("relit (dB)", spread("relit_psnr", 1)),
@@ -185,16 +191,11 @@ def eikonal(g: SDFSurfels, n_neighbours: int = 6) -> float:
 
 
 def sphere_table(records: list[dict[str, Any]]) -> str:
-    """Return the table."""
-    keys = {"radius_error": 4, "consistency": 4, "depth_bias": 4, "depth_error": 4, "slope": 2}
-    rows = []
-    for when, arms in (("before", ARMS[:1]), ("after", ARMS)):
-        for arm in arms:
-            chosen = [r[when] for r in records if r["arm"] == arm]
-            values = [with_deviation([c[key] for c in chosen], digits) for key, digits in keys.items()]
-            rows.append([arm if when == "after" else "before", *values])
-    heading = ["opacity", "radius error of x_0", "std of s - true s", "depth bias", "|depth error|", "ds/dn"]
-    return markdown_table(heading, rows)
+    """Return the table: what all arms begin with, and each at its end."""
+    before = [{"arm": "before", **record["before"]} for record in records if record["arm"] == ARMS[0]]
+    return table(
+        [*before, *({"arm": record["arm"], **record["after"]} for record in records)], {"arm": "opacity"}, SPHERE
+    )
 
 
 # --- relight ---

@@ -21,7 +21,7 @@ from data_tools.claims.kit import recovery
 from data_tools.claims.kit.claim import CALIBRATION, declare
 from data_tools.claims.kit.figures import subplots
 from data_tools.claims.kit.recovery import ARMS, COLORS
-from minisplat_ref.interface.reporting import markdown_table
+from data_tools.claims.kit.tables import mean
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
@@ -30,6 +30,7 @@ from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Floats, Gaussians, Model, Scene
 
+COLUMNS = (("maps off by (levels of 255)", mean("levels", 2)), ("held-out PSNR (dB)", mean("psnr", 2)))
 GAINS = (0.7, 1.4)  # per channel, uniform in the logarithm
 OFFSETS = (0.0, 0.09)
 DARKER = 1 / 1.5  # factor of all photographs, so that none saturates: part of the common map
@@ -39,10 +40,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Disturb, train and measure."""
     scene, recipe = recovery.scene_and_recipe(args)
     arms = measure(scene, recipe, args.seed)
-    description, heading = recovery.describe(args, scene)
-    rows = [[arm, f"{np.mean(row['levels']):.2f}", f"{row['psnr']:.2f}"] for arm, row in arms.items()]
-    table = markdown_table(["training", "maps off by (levels of 255)", "held-out PSNR (dB)"], rows)
-    return kit.Report({**description, "arms": arms}, draw(arms), f"{heading}\n\n{table}", recovery.compared(arms))
+    return recovery.report(args, scene, arms, COLUMNS, draw(arms))
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARMS) -> dict[str, dict[str, Any]]:

@@ -22,8 +22,8 @@ from data_tools.claims.kit import recovery
 from data_tools.claims.kit.claim import CALIBRATION, argument, declare
 from data_tools.claims.kit.figures import subplots
 from data_tools.claims.kit.recovery import ARMS
+from data_tools.claims.kit.tables import mean
 from minisplat_ref.errors import InputError
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
@@ -64,17 +64,14 @@ def run(args: argparse.Namespace) -> kit.Report:
     scene, recipe = recovery.scene_and_recipe(args)
     disturbance = Disturbance(args.degrees, args.shift)
     arms = measure(scene, recipe, disturbance, args.seed)
-    description, heading = recovery.describe(args, scene)
-    rows = []
-    for arm, row in arms.items():
-        degrees, shift, pixels = (float(np.mean(row[key])) for key in ("degrees", "shifts", "pixels"))
-        cells = (f"{degrees:.3f}", f"{100 * shift / scene.extent:.3f}", f"{pixels:.3f}", f"{row['psnr']:.2f}")
-        rows.append([arm, *cells])
-    table = markdown_table(
-        ["training", "angle (degrees)", "centre (% of extent)", "points (px)", "held-out PSNR (dB)"], rows
+    columns = (
+        ("angle (degrees)", mean("degrees", 3)),
+        ("centre (% of extent)", mean(lambda row: 100 * np.asarray(row["shifts"]) / scene.extent, 3)),
+        ("points (px)", mean("pixels", 3)),
+        ("held-out PSNR (dB)", mean("psnr", 2)),
     )
-    result = {**description, **disturbance._asdict(), "extent": scene.extent, "arms": arms}
-    return kit.Report(result, draw(arms), f"{heading}\n\n{table}", recovery.compared(arms))
+    more = {**disturbance._asdict(), "extent": scene.extent}
+    return recovery.report(args, scene, arms, columns, draw(arms), **more)
 
 
 def measure(

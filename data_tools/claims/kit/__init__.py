@@ -4,8 +4,8 @@ A claim's module measures, draws and returns a :class:`Report`; :func:`carry_out
 and prints the report. Trainings take long: with :func:`.records.resume` a claim stores the record of each as soon as it
 ends, and continues with the missing ones when it is called again with the same folder.
 
-Means over seeds, tables and curves are in :mod:`.figures`. Neither module loads Numba or matplotlib by itself, so that
-commands can use them.
+Means over seeds, bars and curves are in :mod:`.figures`, tables of records in :mod:`.tables`. None of these modules
+loads Numba or matplotlib by itself, so that commands can use them.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from data_tools.claims.kit.claim import FIGURE, RESULT
-from data_tools.claims.kit.figures import STYLE
+from data_tools.claims.kit.figures import STYLE, group
 from data_tools.claims.kit.records import jobs_of as jobs_of
 from data_tools.claims.kit.records import resume as resume
 from data_tools.claims.kit.records import resume_all as resume_all
@@ -147,10 +147,9 @@ def _in_words(idle: Mapping[str, str]) -> str:
 
 def arms_of(records: Iterable[Mapping[str, Any]], key: str, measures: Sequence[str]) -> dict[str, Any]:
     """Return for each value of ``key`` the measures of its records, in their order."""
-    arms: dict[str, Any] = {}
-    for record in records:
-        arms.setdefault(record[key], []).append([record[measure] for measure in measures])
-    return arms
+    return {
+        arm: [[record[measure] for measure in measures] for record in own] for arm, own in group(records, key).items()
+    }
 
 
 def measure_arms(arms: Collection[str], n_seeds: int, measure: Callable[[str, int], Any]) -> list[dict[str, Any]]:

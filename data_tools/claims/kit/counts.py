@@ -62,9 +62,9 @@ def measure_curves(
         for seed in range(args.seeds)
     ]
 
-    def train_and_measure(curve: str, settings: dict[str, float], seed: int) -> list[dict[str, Any]]:
+    def train_and_measure(curve: str, settings: dict[str, float], seed: int) -> dict[str, Any]:
         recipe = find(curves[curve].recipe, args.iterations)
-        return [measure(scene, configure(recipe, **curves[curve].common, **settings), seed)]
+        return measure(scene, configure(recipe, **curves[curve].common, **settings), seed)
 
     found = kit.resume(args.out, settings, jobs, train_and_measure)
     records = [record for job in jobs for record in found if job.items() <= record.items()]

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from data_tools.claims import kit
+from data_tools.claims.kit.tables import Columns, table
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.palette import BLUE, EDGE_COLOR, GREY, RED
@@ -33,15 +35,23 @@ def scene_and_recipe(args: argparse.Namespace) -> tuple[Scene, Recipe]:
     return scene, get_recipe(RECIPE, args.iterations)
 
 
-def describe(args: argparse.Namespace, scene: Scene) -> tuple[dict[str, Any], str]:
-    """Return the scene and the settings, for the result and in two lines."""
+def report(
+    args: argparse.Namespace,
+    scene: Scene,
+    arms: dict[str, dict[str, Any]],
+    columns: Columns,
+    figure: Figure,
+    **more: Any,
+) -> kit.Report:
+    """Return the report of the three trainings; ``more`` belongs to the result.
+
+    Neither the disturbance nor its correction may have done nothing.
+    """
     description = {**kit.describe_scene(scene), "recipe": RECIPE, **kit.settings_of(args, "iterations", "seed")}
-    return description, f"{kit.title(description)}\n{RECIPE}, {args.iterations} iterations, seed {args.seed}"
-
-
-def compared(arms: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return what must differ: neither the disturbance nor its correction may have done nothing."""
-    return {arm: row["psnr"] for arm, row in arms.items()}
+    heading = f"{kit.title(description)}\n{RECIPE}, {args.iterations} iterations, seed {args.seed}"
+    text = table([{"arm": arm, **row} for arm, row in arms.items()], {"arm": "training"}, columns)
+    compared = {arm: row["psnr"] for arm, row in arms.items()}
+    return kit.Report({**description, **more, "arms": arms}, figure, f"{heading}\n\n{text}", compared)
 
 
 def draw_errors(axes: Axes, arms: dict[str, dict[str, Any]], measure: str) -> None:

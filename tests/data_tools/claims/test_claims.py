@@ -1,6 +1,5 @@
 """Claims: through the command line with tiny settings, and what their tables say must be what was measured."""
 
-import json
 import re
 from pathlib import Path
 
@@ -11,10 +10,9 @@ import minisplat_ref
 from data_tools.claims import all_claims
 from data_tools.claims import depth as depth_types
 from data_tools.claims.__main__ import main as measure_claim
-from data_tools.claims.kit.claim import FIGURE, RESULT
+from measured_claims import read_result
 from minisplat_ref.app.cli import main
 from minisplat_ref.io import load_scene, save_ply
-from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.training.initial_state import initial_state
 
@@ -26,13 +24,6 @@ def scene_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("claims") / "room"
     assert main(["synthetic", "room", "--out", str(folder), *TINY]) == 0
     return folder
-
-
-def read_result(folder):
-    """The JSON, and a figure that is an image with something in it."""
-    assert sorted(path.name for path in folder.iterdir()) == sorted([FIGURE, RESULT])
-    assert read_image(folder / FIGURE).std() > 1
-    return json.loads((folder / RESULT).read_text())
 
 
 def table_rows(text):
