@@ -44,10 +44,9 @@ from minisplat_ref.extensions.antialiasing.reference import smooth
 from minisplat_ref.extensions.compression.lattice import from_lattice, to_lattice
 from minisplat_ref.extensions.compression.levels import exponents
 from minisplat_ref.extensions.compression.msz import CONTAINER, decode, encode
-from minisplat_ref.extensions.micro.reference import trace_penalty, trace_penalty_vjp, traces
-from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
-from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
+from minisplat_ref.extensions.micro.model import trace_penalty, trace_penalty_vjp, traces
+from minisplat_ref.extensions.multi_scale.model import LEVELS, Plan, add_levels, are_shown, level_zero, pixel_densities
+from minisplat_ref.extensions.multi_scale.recipe import COVERAGE_MIN, finest_densities
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
@@ -218,7 +217,7 @@ photograph, camera = view.image / 255, view.camera
 
 levels = level_zero(room, np.random.default_rng(0))
 densities = finest_densities(room.means, [v.camera for v in scene.train_views])
-levels = with_levels(levels, densities, Plan(2, 4, COVERAGE_MIN), GSPLAT_MAIN)
+levels = add_levels(levels, densities, Plan(2, 4, COVERAGE_MIN), GSPLAT_MAIN)
 
 
 def drawn(population, n):

@@ -49,12 +49,17 @@ from data_tools.claims.rays.demo import (
 )
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.pixel_order.method import ORDERED
-from minisplat_ref.extensions.rays.kernels import tree_of
-from minisplat_ref.extensions.rays.lights import shade
-from minisplat_ref.extensions.rays.method import whiten_model
-from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.pixel_order.model import ORDERED
+from minisplat_ref.extensions.rays.lights import (
+    GLASS,
+    MIRROR,
+    Surroundings,
+    concatenate_surfaces,
+    make_surfaces,
+    parallelogram,
+    shade,
+)
+from minisplat_ref.extensions.rays.model import build_tree, whiten_model
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
@@ -358,7 +363,7 @@ plt.show()
 
 # %%
 eye = Camera(np.eye(3), np.zeros(3), 132.0, 132.0, 60.0, 45.0, 120, 90)
-tree = tree_of(whiten_model(Model(scene)), GSPLAT_MAIN)
+tree = build_tree(whiten_model(Model(scene)), GSPLAT_MAIN)
 rays = pixel_rays(eye, GSPLAT_MAIN)
 n_asked, n_boxes = np.zeros(len(rays.near), int), np.zeros(len(rays.near), int)
 by_level = {}
@@ -426,8 +431,8 @@ def cube(centre, half, yaw):
     return Mesh(centre + half * corners @ turn.T, faces)
 
 
-mirror = surfaces_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
-block = surfaces_of(cube(np.array([0.15, 0.58, 3.3]), 0.3, 0.5), GLASS, np.array([0.95, 1.0, 0.97]), 1.5)
+mirror = make_surfaces(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
+block = make_surfaces(cube(np.array([0.15, 0.58, 3.3]), 0.3, 0.5), GLASS, np.array([0.95, 1.0, 0.97]), 1.5)
 around = {
     "as it was photographed": Surroundings(NO_LAMP, 1.0, 0.0, NO_SURFACE),
     "a lamp": Surroundings(LAMP[None], 0.35, BIAS, NO_SURFACE),

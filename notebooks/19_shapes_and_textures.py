@@ -47,7 +47,7 @@ from minisplat_ref.extensions.cuts.curve import VERTICES, evaluate_cuts
 from minisplat_ref.extensions.fans.method import render as render_fans
 from minisplat_ref.extensions.fans.shapes import FanShape, convert_gaussians, mesh_of
 from minisplat_ref.extensions.mixed import response as hull_response
-from minisplat_ref.extensions.polygons.soup import soup_of
+from minisplat_ref.extensions.polygons.soup import make_soup
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import with_textures
 from minisplat_ref.extensions.textured.reference import frames, meet
@@ -355,7 +355,7 @@ plt.show()
 # %%
 sheet = polygon_claims.sheet(5)  # of 5 x 5 splats
 sheet = sheet._replace(log_scales=sheet.log_scales - np.log(2.5))  # so small that they hardly overlap
-soup = soup_of(sheet, 8)
+soup = make_soup(sheet, 8)
 SHEAR = np.array([[1.0, 0.5, 0.0], [0.0, 0.8, 0.0], [0.3, 0.0, 1.0]])
 edits = {"at rest": soup.corners, "sheared": soup.corners @ SHEAR.T}
 edits["bent by 180 degrees"] = polygon_claims.bend(soup.corners, 180)
@@ -376,7 +376,7 @@ per_side, bend_misses = (4, 8, 16, 32), {}
 for angle, color in ((45, BLUE), (180, RED)):
     found = []
     for number in per_side:
-        these = soup_of(polygon_claims.sheet(number), 8)
+        these = make_soup(polygon_claims.sheet(number), 8)
         corners = polygon_claims.bend(these.corners, angle)
         refit = rims(*fit_spans(corners, these.radii), these.radii, 8)
         spread = np.sqrt(np.mean((corners - corners.mean(axis=1, keepdims=True)) ** 2))

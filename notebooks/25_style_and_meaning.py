@@ -28,10 +28,8 @@ from data_tools.claims import style as style_study
 from figures import BLUE, GREY, RED, show, show_code
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.segment.assignment import belongs, labels
-from minisplat_ref.extensions.segment.maps import label_map
-from minisplat_ref.extensions.segment.render import paint
-from minisplat_ref.extensions.segment.votes import count_votes, votes_of_view
+from minisplat_ref.extensions.segment.commands import paint
+from minisplat_ref.extensions.segment.votes import assign_labels, belongs, count_view_votes, count_votes, label_map
 from minisplat_ref.extensions.style.reference import match_colors
 from minisplat_ref.extensions.style.styling import Plan, stylise
 from minisplat_ref.mechanisms.features.filters import CLASSICAL, EVEN, gabor_filters
@@ -68,13 +66,13 @@ _ = figure
 # Gaussian's colour *is* the sum of its weights there.
 
 # %%
-show_code(votes_of_view)
+show_code(count_view_votes)
 show_code(belongs)
 
 # %% tags=["rounding"]
 cameras = [v.camera for v in made.scene.train_views]
 votes = count_votes(room, SPLATTING, zip(cameras, masks, strict=True), range(5))
-found = labels(votes, 0.0)
+found = assign_labels(votes, 0.0)
 drawn = label_map(room, found, SPLATTING, view.camera)
 truth = masks_study.object_ids(made.test_ids[1])
 iou = masks_study.mean_iou([drawn], [truth])
@@ -99,7 +97,7 @@ curves = {}
 for name in ("clean", "all shifted", "30 % lost"):
     spoiled = masks_study.spoil(masks, *masks_study.CONDITIONS[name], np.random.default_rng(0))
     own = count_votes(room, SPLATTING, zip(cameras, spoiled, strict=True), range(5))
-    maps = (label_map(room, labels(own, bias), SPLATTING, view.camera) for bias in biases)
+    maps = (label_map(room, assign_labels(own, bias), SPLATTING, view.camera) for bias in biases)
     curves[name] = [masks_study.mean_iou([map_], [truth]) for map_ in maps]
 figure, axes = plt.subplots(figsize=(5.5, 2.4))
 for (name, curve), color in zip(curves.items(), (GREY, BLUE, RED), strict=True):
@@ -182,7 +180,7 @@ _ = figure
 # from minisplat_ref.extensions.segment.votes import Votes
 #
 # by_hand = Votes((0, 1), np.array([[0.0, 0.9], [0.6, 0.3]]))
-# assert labels(by_hand, 0.0).tolist() == [1, 0]
+# assert assign_labels(by_hand, 0.0).tolist() == [1, 0]
 # ```
 #
 # </details>

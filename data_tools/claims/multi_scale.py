@@ -16,8 +16,8 @@ from data_tools.claims.kit.claim import OUT, declare, downscale, iterations, sce
 from data_tools.claims.kit.figures import plot_band, show, with_deviation
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
+from minisplat_ref.extensions.multi_scale.model import LEVELS, Plan, add_levels, level_zero
+from minisplat_ref.extensions.multi_scale.recipe import COVERAGE_MIN, finest_densities
 from minisplat_ref.interface.palette import BLUE, BROWN, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
@@ -66,7 +66,7 @@ def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     )
     zero = level_zero(plain, np.random.default_rng(0))
     densities = finest_densities(plain.means, [view.camera for view in scene.train_views])
-    built = {name: with_levels(zero, densities, plan, GSPLAT_MAIN) for name, plan in PLANS.items()}
+    built = {name: add_levels(zero, densities, plan, GSPLAT_MAIN) for name, plan in PLANS.items()}
     early = built["levels 4"]._replace(cells=built["levels 4"].cells / EARLY)
     recipe = configure(find_recipe("multi-scale", iterations), factor=4, n_levels=2)
     trained = kit.train_with_progress(scene, recipe, seed, backend=CPU).gaussians

@@ -20,9 +20,7 @@ from data_tools.claims.kit.objects import OBJECTS, mean_iou, object_ids
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.segment.assignment import labels
-from minisplat_ref.extensions.segment.maps import label_map
-from minisplat_ref.extensions.segment.votes import count_votes
+from minisplat_ref.extensions.segment.votes import assign_labels, count_votes, label_map
 from minisplat_ref.interface.palette import SERIES
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.types import Gaussians, Ints
@@ -64,7 +62,7 @@ def measure(made: SyntheticScene, gaussians: Gaussians, seed: int) -> list[dict[
         every = range(1 + len(OBJECTS))
         votes = count_votes(gaussians, SPLATTING, zip(cameras, masks, strict=True), every)
         for bias in BIASES:
-            found = labels(votes, bias)
+            found = assign_labels(votes, bias)
             drawn = [label_map(gaussians, found, SPLATTING, view.camera) for view in made.scene.test_views]
             records.append({"masks": name, "bias": bias, "iou": mean_iou(drawn, truth)})
     return records

@@ -15,7 +15,7 @@ import numpy as np
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import declare, iterations, seed
-from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY, MovingGaussians
+from minisplat_ref.extensions.velocity.model import MOVING, VELOCITY, MovingGaussians
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate

@@ -31,7 +31,7 @@ from minisplat_ref.extensions.lucas_kanade.reference import (
     turned,
     turned_vjp,
 )
-from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
+from minisplat_ref.extensions.velocity.model import MOVING, MovingGaussians
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.oracle.gradients import inner_product_case

@@ -15,21 +15,21 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.micro.method import (
-    clone_and_split_by_detail,
-    clusters,
-    halve_children,
-    halve_large,
-    merge_alike,
-    prune_least,
-)
-from minisplat_ref.extensions.micro.reference import (
+from minisplat_ref.extensions.micro.model import (
     are_alike,
     box_means,
     detail_map,
     trace_penalty,
     trace_penalty_vjp,
     traces,
+)
+from minisplat_ref.extensions.micro.recipe import (
+    clone_and_split_by_detail,
+    clusters,
+    halve_children,
+    halve_large,
+    merge_alike,
+    prune_least,
 )
 from minisplat_ref.methods.gaussian_splatting import prune_large
 from minisplat_ref.oracle.models import check_model_gradients

@@ -17,9 +17,18 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import LEVELS, coarse, finest_densities, insert_levels
-from minisplat_ref.extensions.multi_scale.reference import NO_CELL, are_shown, coverages, pixel_densities
+from minisplat_ref.extensions.multi_scale.model import (
+    LEVELS,
+    NO_CELL,
+    MultiScaleGaussians,
+    Plan,
+    add_levels,
+    are_shown,
+    coverages,
+    level_zero,
+    pixel_densities,
+)
+from minisplat_ref.extensions.multi_scale.recipe import coarse, finest_densities, insert_levels
 from minisplat_ref.io.label import Label
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
@@ -56,7 +65,7 @@ def camera_of(size, focal=64.0):
 
 def in_levels(gaussians, plan, camera=None):
     densities = finest_densities(gaussians.means, [camera or camera_of(64)])
-    return with_levels(level_zero(gaussians, None), densities, plan, GSPLAT_MAIN)
+    return add_levels(level_zero(gaussians, None), densities, plan, GSPLAT_MAIN)
 
 
 def shown_in(levels, camera):

@@ -9,17 +9,28 @@ from numpy.testing import assert_allclose
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.mvg import method
-from minisplat_ref.extensions.mvg.insertion import Insertions, Photographed, Rules, propose, uncovered
-from minisplat_ref.extensions.mvg.losses import depth_steps, filtered_normals
-from minisplat_ref.extensions.mvg.method import MVG, facing, photographed, surfels_at
-from minisplat_ref.extensions.mvg.reference import (
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.extensions.mvg import insertion, recipe
+from minisplat_ref.extensions.mvg.insertion import (
+    Insertions,
+    Photographed,
+    Rules,
     depth_cuts,
     depth_density,
-    edge_aware_steps,
-    edge_aware_steps_vjp,
     levels_of,
     on_grid,
+    propose,
+    uncovered,
+)
+from minisplat_ref.extensions.mvg.recipe import (
+    MVG,
+    depth_steps,
+    edge_aware_steps,
+    edge_aware_steps_vjp,
+    facing,
+    filtered_normals,
+    photographed,
+    surfels_at,
 )
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances
 from minisplat_ref.mechanisms.oriented.thin_axis import normals_of
@@ -280,7 +291,7 @@ def test_the_recipe_trains_through_the_command_line(tmp_path, capsys):
 
 
 def test_an_insertion_that_finds_nothing_says_so(monkeypatch, rng):
-    monkeypatch.setattr(method, "photographed", lambda *arguments: seen_from(0.0, 0.0))
+    monkeypatch.setattr(recipe, "photographed", lambda *arguments: seen_from(0.0, 0.0))
 
     class State:
         model, gaussians = None, Gaussians(*np.zeros((6, 1, 3)))
@@ -288,7 +299,7 @@ def test_an_insertion_that_finds_nothing_says_so(monkeypatch, rng):
     State.rng = rng
     scene = Scene("s", (view_from(seen_from(0, 1).seen.camera),), (), None, None, None, 1.0)
     strides = {"near_stride": 1, "far_stride": 1}
-    note = method.insert_consistent(State, _Iteration(scene), n_views=1, n_sources=1, **strides)
+    note = recipe.insert_consistent(State, _Iteration(scene), n_views=1, n_sources=1, **strides)
     assert "no pixel" in note
 
 
@@ -299,14 +310,14 @@ def test_near_and_far_have_strides_of_their_own(monkeypatch, rng):
         asked.append(rules)
         return insertions_at(np.zeros((0, 3)), [])
 
-    monkeypatch.setattr(method, "propose", propose)
+    monkeypatch.setattr(recipe, "propose", propose)
 
     class State:
         model, gaussians = None, Gaussians(*np.zeros((6, 1, 3)))
 
     State.rng = rng
     scene = Scene("s", (), (), None, None, None, 1.0)
-    method.insert_consistent(State, _Iteration(scene), n_views=3, n_sources=5, near_stride=7, far_stride=2)
+    recipe.insert_consistent(State, _Iteration(scene), n_views=3, n_sources=5, near_stride=7, far_stride=2)
     assert asked == [Rules(Tolerances(n_views=3), 5, (7, 0, 2))]
 
 

@@ -15,14 +15,18 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.negative.method import (
+from minisplat_ref.extensions.negative.model import (
     FRACTION,
     SIGNED,
     compute_signed_colors,
     compute_signed_colors_vjp,
+    density,
+    difference,
+    largest_weight,
+    negate,
     with_negatives,
 )
-from minisplat_ref.extensions.negative.reference import density, difference, largest_weight, negate
+from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
 from minisplat_ref.rendering.backends import REFERENCE

@@ -19,8 +19,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.pixel_order.gradient_checks import stages
-from minisplat_ref.extensions.pixel_order.method import ORDERED
+from minisplat_ref.extensions.pixel_order.model import ORDERED, stages
 from minisplat_ref.mechanisms.tangent import planes as planes
 from minisplat_ref.mechanisms.tangent.rays import color_changes, tangent_hits, yaw_camera
 from minisplat_ref.mechanisms.tangent.renderer import RESPONSE

@@ -16,12 +16,20 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.polygons import reference
-from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
-from minisplat_ref.extensions.polygons.gradient_checks import stages
-from minisplat_ref.extensions.polygons.kernels import TRIANGLE, fans_of
-from minisplat_ref.extensions.polygons.kernels import tree_of as triangle_tree
-from minisplat_ref.extensions.polygons.method import LOG_THICKNESS, TRACED, press_flat, tracer_for
+from minisplat_ref.extensions.polygons import model
+from minisplat_ref.extensions.polygons.kernels import TRIANGLE
+from minisplat_ref.extensions.polygons.kernels import build_tree as triangle_tree
+from minisplat_ref.extensions.polygons.model import (
+    LOG_THICKNESS,
+    TRACED,
+    Polygons,
+    make_fans,
+    make_polygons,
+    make_tracer,
+    press_flat,
+    spans_vjp,
+    stages,
+)
 from minisplat_ref.mechanisms.meshes.fans import opacity_radii, rims
 from minisplat_ref.mechanisms.rays import kernels
 from minisplat_ref.mechanisms.rays.blending import sum_by_row
@@ -67,11 +75,11 @@ def several(*some):
 
 def random_polygons(rng, n, n_sides=8):
     g = make_gaussians(rng, n)
-    return polygons_of(g, 1 / (1 + np.exp(-g.opacity_logits)), n_sides)
+    return make_polygons(g, 1 / (1 + np.exp(-g.opacity_logits)), n_sides)
 
 
 def hits_of(polygons, rays, backend=CPU, conventions=GSPLAT_MAIN):
-    return tracer_for(polygons, conventions, backend).list_hits(rays, conventions)
+    return make_tracer(polygons, conventions, backend).list_hits(rays, conventions)
 
 
 # --- one ray and one polygon ---
@@ -132,11 +140,11 @@ def test_many_sides_are_an_ellipse(rng):
     """With ever more sides nothing of an ellipse of alpha 1/255 is cut off; eight cut some, and never add any."""
     rays, alphas = pixel_rays(make_camera(), GSPLAT_MAIN), {}
     for n_sides in (3, 8, 64):
-        blended = tracer_for(random_polygons(np.random.default_rng(3), 1, n_sides), GSPLAT_MAIN, REFERENCE).blend(
+        blended = make_tracer(random_polygons(np.random.default_rng(3), 1, n_sides), GSPLAT_MAIN, REFERENCE).blend(
             np.ones((1, 3)), rays, BLACK, GSPLAT_MAIN
         )
         alphas[n_sides] = 1 - blended.transmittances
-    full = tracer_for(
+    full = make_tracer(
         random_polygons(np.random.default_rng(3), 1)._replace(radii=np.array([1e3])), GSPLAT_MAIN, REFERENCE
     )
     expected = 1 - full.blend(np.ones((1, 3)), rays, BLACK, GSPLAT_MAIN).transmittances
@@ -155,11 +163,11 @@ def test_the_gradient_of_a_meeting(rng):
 
     def forward(means, spans, opacities, origins, directions):
         moved = polygons._replace(means=means, spans=spans, opacities=opacities)
-        pairs = reference.meet(moved, rays._replace(origins=origins, directions=directions), ray_ids, ids)
+        pairs = model.meet(moved, rays._replace(origins=origins, directions=directions), ray_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.meet_vjp(polygons, rays, ray_ids, ids, v_unclamped, v_depths)
+        parts = model.meet_vjp(polygons, rays, ray_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, ray_ids, ray_ids)
         return tuple(sum_by_row(part, row, 3 + (row is ray_ids)) for part, row in zip(parts, rows, strict=True))
 
@@ -170,9 +178,9 @@ def test_the_gradient_of_a_meeting(rng):
 def test_the_gradient_of_spans(rng):
     g = make_gaussians(rng, 3)
     o = 1 / (1 + np.exp(-g.opacity_logits))
-    polygons = polygons_of(g, o)
+    polygons = make_polygons(g, o)
     check_jacobian(
-        lambda quats, log_scales: (polygons_of(g._replace(quats=quats, log_scales=log_scales), o).spans,),
+        lambda quats, log_scales: (make_polygons(g._replace(quats=quats, log_scales=log_scales), o).spans,),
         lambda v: spans_vjp(g, polygons, v),
         [g.quats, g.log_scales],
         names=["quats", "log_scales"],
@@ -189,7 +197,7 @@ def test_polygons_triangles_and_the_reference_agree(n, n_sides, rng):
     targets = np.concatenate([polygons.means, rng.normal((0, 0, 3), 1, (100, 3))])  # also straight at the centres
     origins = rng.normal(size=(len(targets), 3))
     rays = rays_along(origins, targets - origins)
-    triangles = kernels.tracer_of(TRIANGLE, triangle_tree(fans_of(polygons), GSPLAT_MAIN))
+    triangles = kernels.tracer_of(TRIANGLE, triangle_tree(make_fans(polygons), GSPLAT_MAIN))
     theirs = hits_of(polygons, rays, REFERENCE)
     assert len(theirs.ray_ids) >= n
     for ours in (hits_of(polygons, rays, CPU), triangles.list_hits(rays, GSPLAT_MAIN)):
@@ -202,10 +210,10 @@ def test_polygons_triangles_and_the_reference_agree(n, n_sides, rng):
 def test_the_gradient_of_triangles_is_that_of_their_polygon(rng):
     """Of quaternions and scales: spans that shear, which no Gaussian has, are other polygons and other triangles."""
     g, rays, found = make_gaussians(rng, 20), pixel_rays(make_camera(), GSPLAT_MAIN), []
-    polygons, colors = polygons_of(g, 1 / (1 + np.exp(-g.opacity_logits))), rng.uniform(size=(20, 3))
+    polygons, colors = make_polygons(g, 1 / (1 + np.exp(-g.opacity_logits))), rng.uniform(size=(20, 3))
     v_image, v_depths, v_T = (rng.normal(size=(len(rays.near), *shape)) for shape in ((3,), (), ()))
-    triangles = kernels.tracer_of(TRIANGLE, triangle_tree(fans_of(polygons), GSPLAT_MAIN))
-    for tracer in (tracer_for(polygons, GSPLAT_MAIN, CPU), triangles):
+    triangles = kernels.tracer_of(TRIANGLE, triangle_tree(make_fans(polygons), GSPLAT_MAIN))
+    for tracer in (make_tracer(polygons, GSPLAT_MAIN, CPU), triangles):
         blended = tracer.blend(colors, rays, BLACK, GSPLAT_MAIN)
         v = tracer.blend_vjp(colors, rays, BLACK, GSPLAT_MAIN, blended, (v_image, v_depths, v_T))
         v_quats, v_log_scales = spans_vjp(g, polygons, v.shapes)
@@ -222,7 +230,7 @@ def test_a_ray_whose_hits_find_no_room_is_traced_again(rng, monkeypatch):
     v_blended = np.ones((len(rays.near), 3)), np.ones(len(rays.near)), np.ones(len(rays.near))
     for room in (kernels.HITS_KEPT_MAX, 3):
         monkeypatch.setattr(kernels, "HITS_KEPT_MAX", room)
-        tracer = tracer_for(polygons, GSPLAT_MAIN, CPU)
+        tracer = make_tracer(polygons, GSPLAT_MAIN, CPU)
         blended = tracer.blend(colors, rays, BLACK, GSPLAT_MAIN)
         assert (blended.kept is None) == (room == 3)
         v = tracer.blend_vjp(colors, rays, BLACK, GSPLAT_MAIN, blended, v_blended)
@@ -321,7 +329,7 @@ def test_what_cannot_be_drawn_is_left_out(rng):
     for backend in (CPU, REFERENCE):
         images = []
         for polygons in (good, both):
-            tracer, ones = tracer_for(polygons, GSPLAT_MAIN, backend), np.ones((len(polygons.means), 3))
+            tracer, ones = make_tracer(polygons, GSPLAT_MAIN, backend), np.ones((len(polygons.means), 3))
             blended = tracer.blend(ones, rays, BLACK, GSPLAT_MAIN)
             v = tracer.blend_vjp(ones, rays, BLACK, GSPLAT_MAIN, blended, (blended.image, rays.near, rays.near))
             assert all(np.isfinite(array).all() for array in (*blended[:5], *v))
@@ -348,7 +356,7 @@ def test_training_starts_flat_and_facing_everywhere():
     n = 3000
     flat = press_flat(balls(np.zeros((n, 3)), np.full(n, 0.3), np.full(n, 0.5)), np.random.default_rng(0))
     assert_allclose(np.exp(np.sort(flat.log_scales, axis=1)), [[1e-5, 0.3, 0.3]] * n, rtol=1e-9)
-    spans = polygons_of(flat, np.ones(n)).spans
+    spans = make_polygons(flat, np.ones(n)).spans
     normals = np.cross(spans[:, :, 0], spans[:, :, 1]) / 0.09
     assert_allclose(normals.T @ normals / n, np.eye(3) / 3, atol=0.022)
 

@@ -8,7 +8,7 @@ from data_tools.claims.polygons import edits as claims
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, save_soup, soup_of
+from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, make_soup, save_soup
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
@@ -81,9 +81,27 @@ def test_what_was_not_moved_keeps_its_bytes(files, tmp_path, capsys):
         assert out.read_bytes() == files[0].read_bytes()
 
 
+@pytest.mark.parametrize("name", claims.MAPS)
+@pytest.mark.parametrize("n_sides", [3, 8])
+def test_an_affine_edit_is_the_gaussians_transformed(name, n_sides, rng):
+    before, A = model(rng), claims.MAPS[name]
+    soup = make_soup(before, n_sides)
+    after, n = carry_gaussians(before, soup, soup.corners @ A.T + SHIFT, "it")
+    assert n == 28
+    direct = planar(before)[soup.rows]
+    expected = A @ direct @ A.T
+    scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    assert_allclose(after.means[soup.rows], before.means[soup.rows] @ A.T + SHIFT, atol=AFFINE_EDIT)
+    assert_allclose(planar(after)[soup.rows] / scale, expected / scale, atol=AFFINE_EDIT)
+    assert is_same([f[[3, 7]] for f in after], [f[[3, 7]] for f in before])
+    again = make_soup(after, n_sides)
+    if name in ("turn", "turn and scale"):  # elsewhere the axes of the ellipse lie at other corners
+        assert_allclose(again.corners, soup.corners @ A.T + SHIFT, atol=AFFINE_EDIT)
+
+
 def test_colours_turn_along(rng):
     before = model(rng)
-    soup = soup_of(before, 8)
+    soup = make_soup(before, 8)
     after, _ = carry_gaussians(before, soup, 0.7 * soup.corners @ TURN.T, "it")
     direct = deform(before, before.means, Deformation(0.7 * TURN[None], np.zeros(30, int)))
     assert_allclose(after.sh_rest[soup.rows], direct.sh_rest[soup.rows], atol=AFFINE_EDIT)
@@ -97,10 +115,10 @@ def test_colours_turn_along(rng):
 def test_the_plane_stays_the_plane_when_a_polygon_shrinks(rng):
     """By more than its Gaussian is thick: a plain 3DGS model has thick ones."""
     before = make_gaussians(rng, 20)
-    soup = soup_of(before, 8)
+    soup = make_soup(before, 8)
     centres = soup.corners.mean(axis=1, keepdims=True)
     after, _ = carry_gaussians(before, soup, centres + 0.01 * (soup.corners - centres), "it")
-    assert_allclose(soup_of(after, 8).corners, centres + 0.01 * (soup.corners - centres), atol=PARITY_FLOAT64)
+    assert_allclose(make_soup(after, 8).corners, centres + 0.01 * (soup.corners - centres), atol=PARITY_FLOAT64)
     assert_allclose(after.log_scales, before.log_scales + np.log(0.01), atol=1e-9)
 
 
@@ -112,7 +130,7 @@ def test_one_moved_vertex_changes_one_gaussian(files, tmp_path, capsys):
     assert main(["polygons", "edit", str(files[0]), str(tmp_path / "moved.ply"), "--out", str(out)]) == 0
     assert "1 of 30 Gaussians follow" in capsys.readouterr().out
     before, after = load_ply(files[0]), load_ply(out)
-    row = soup_of(before, 8).rows[5]
+    row = make_soup(before, 8).rows[5]
     others = np.delete(np.arange(30), row)
     assert is_same([f[others] for f in after], [f[others] for f in before])
     assert after.means[row, 1] - before.means[row, 1] == pytest.approx(0.05 / 8, rel=1e-3)
@@ -129,7 +147,7 @@ def test_a_soup_has_colour_and_opacity_in_bytes(tmp_path):
 
 def test_a_polygon_may_be_narrow_but_not_a_line():
     gaussians = one()
-    soup = soup_of(gaussians, 8)
+    soup = make_soup(gaussians, 8)
     narrow, n_edited = carry_gaussians(gaussians, soup, soup.corners * [1, 1e-4, 1], "soup.ply")
     assert n_edited == 1
     assert_allclose(np.exp(np.sort(narrow.log_scales[0]))[1:], [0.5e-4, 1], rtol=1e-6)
@@ -215,7 +233,7 @@ def test_models_without_polygons_and_odd_sides_are_refused(tmp_path, rng):
 def test_gaussians_of_no_finite_size_are_left_out(rng):
     g = model(rng)
     g.log_scales[0], g.log_scales[1] = 1000, -1000
-    assert_array_equal(soup_of(g, 8).rows, [i for i in range(30) if i not in (0, 1, 3, 7)])
+    assert_array_equal(make_soup(g, 8).rows, [i for i in range(30) if i not in (0, 1, 3, 7)])
 
 
 # --- bending ---
@@ -224,7 +242,7 @@ def test_gaussians_of_no_finite_size_are_left_out(rng):
 def test_a_bent_soup_is_drawn_as_it_is(rng):
     """A sheet that is only moved looks like its Gaussians; the more it is bent, the more these differ."""
     gaussians = claims.sheet(6)
-    soup = soup_of(gaussians, 8)
+    soup = make_soup(gaussians, 8)
     moved = claims.place_sheet(soup.corners)
     after, _ = carry_gaussians(gaussians, soup, moved, "it")
     drawn = claims.render_soup(gaussians, soup, moved)

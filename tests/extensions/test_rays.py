@@ -18,10 +18,8 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import reference
-from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
-from minisplat_ref.extensions.rays.gradient_checks import stages
-from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
+from minisplat_ref.extensions.rays import model
+from minisplat_ref.extensions.rays.model import TRACED, Whitened, make_tracer, stages, whiten, whiten_model, whiten_vjp
 from minisplat_ref.mechanisms.rays import bvh as bvh
 from minisplat_ref.mechanisms.rays.blending import sum_by_row
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays, pixel_rays_vjp
@@ -59,7 +57,7 @@ def one(mean, scales, opacity=0.8, quat=(1.0, 0.0, 0.0, 0.0)):
 
 
 def hits_of(gaussians, rays, backend=CPU, conventions=GSPLAT_MAIN):
-    return tracer_for(gaussians, conventions, backend).list_hits(rays, conventions)
+    return make_tracer(gaussians, conventions, backend).list_hits(rays, conventions)
 
 
 def random_whitened(rng, n, size=0.15):
@@ -99,11 +97,11 @@ def test_the_gradient_of_pairs(rng):
 
     def forward(means, maps, opacities, origins, directions):
         moved = rays._replace(origins=origins, directions=directions)
-        pairs = reference.intersect(Whitened(means, maps, opacities), moved, rays_ids, ids)
+        pairs = model.intersect(Whitened(means, maps, opacities), moved, rays_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.intersect_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
+        parts = model.intersect_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
         return tuple(sum_by_row(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
@@ -249,13 +247,13 @@ def test_the_gradient_of_the_whole_model(backend, small_proof):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch, small_proof):
-    correct = reference.intersect_vjp
+    correct = model.intersect_vjp
 
     def wrong(*args):
         v = correct(*args)
         return v._replace(means=1.001 * v.means)
 
-    monkeypatch.setattr(reference, "intersect_vjp", wrong)
+    monkeypatch.setattr(model, "intersect_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 
@@ -284,7 +282,7 @@ def bare(rng):
         rays = pixel_rays(camera, conventions)
         images = []
         for backend in (CPU, REFERENCE):
-            tracer, ones = tracer_for(gaussians, conventions, backend), np.ones((len(gaussians.means), 3))
+            tracer, ones = make_tracer(gaussians, conventions, backend), np.ones((len(gaussians.means), 3))
             blended = tracer.blend(ones, rays, BLACK, conventions)
             v = tracer.blend_vjp(ones, rays, BLACK, conventions, blended, (blended.image, rays.near, rays.near))
             assert all(np.isfinite(array).all() for array in (*blended[:5], *v))

@@ -11,21 +11,25 @@ from data_tools.claims.rays import measures as claims
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import surroundings
-from minisplat_ref.extensions.rays.lights import irradiance, shade, visibility
-from minisplat_ref.extensions.rays.method import TRACED, whiten_model
-from minisplat_ref.extensions.rays.reference import intersect
-from minisplat_ref.extensions.rays.surfaces import (
+from minisplat_ref.extensions.rays.lights import (
     DIFFUSE,
     GLASS,
     MIRROR,
+    Surroundings,
+    concatenate_surfaces,
     continue_rays,
+    find_normals,
+    irradiance,
+    make_surfaces,
     nearest_triangles,
-    normals_of,
+    parallelogram,
     reflect,
     refract,
+    shade,
+    visibility,
 )
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.model import TRACED, intersect, whiten_model
+from minisplat_ref.extensions.rays.render import check_lights
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, save_mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
@@ -81,7 +85,7 @@ def test_a_ray_in_the_plane_of_a_triangle_misses_it():
 
 def test_the_normals_of_a_box_point_outwards():
     mesh = box([-1, -1, -1], [1, 1, 1])
-    assert_allclose(np.sum(normals_of(mesh.corners) * mesh.corners.mean(axis=1), axis=1), 1)
+    assert_allclose(np.sum(find_normals(mesh.corners) * mesh.corners.mean(axis=1), axis=1), 1)
 
 
 # --- reflection and refraction ---
@@ -114,7 +118,7 @@ def test_a_pane_shifts_what_is_behind_it():
     """A ray through a pane of thickness h keeps its direction and is shifted by h sin(a - b) / cos(b)."""
     h, a = 0.5, np.radians(40)
     b = np.arcsin(np.sin(a) / 1.5)
-    pane = surfaces_of(box([-9, -9, 1], [9, 9, 1 + h]), GLASS)
+    pane = make_surfaces(box([-9, -9, 1], [9, 9, 1 + h]), GLASS)
     d = np.array([[np.sin(a), 0.0, np.cos(a)]])
     rays = rays_of([[0, 0, 0]], d)
     for _ in range(2):
@@ -134,7 +138,7 @@ def test_a_mirror_shows_what_the_mirrored_camera_sees():
 
 def test_glass_of_index_one_is_not_there():
     gaussians, camera = claims.random_gaussians(100, np.random.default_rng(3)), demo.camera_of(32, 24)
-    air = surfaces_of(box([-3, -3, 2], [3, 3, 4.1]), GLASS, index=1.0)
+    air = make_surfaces(box([-3, -3, 2], [3, 3, 4.1]), GLASS, index=1.0)
     images = [
         shade(demo.world_of(gaussians, around(*parts), BLACK), pixel_rays(camera, GSPLAT_MAIN))
         for parts in ((air,), ())
@@ -146,7 +150,7 @@ def test_glass_of_index_one_is_not_there():
 
 def test_two_mirrors_that_face_each_other_end():
     sides = np.array([[4.0, 0, 0], [0, 4.0, 0]])
-    walls = [surfaces_of(parallelogram(np.array([-2, -2, z]), sides), MIRROR) for z in (1.0, -1.0)]
+    walls = [make_surfaces(parallelogram(np.array([-2, -2, z]), sides), MIRROR) for z in (1.0, -1.0)]
     world = demo.world_of(claims.random_gaussians(0, np.random.default_rng(0)), around(*walls), np.ones(3))
     assert_allclose(shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]])), 1)  # after three of them, the background
 
@@ -154,7 +158,7 @@ def test_two_mirrors_that_face_each_other_end():
 def test_after_three_surfaces_a_ray_sees_through_the_next():
     """Between mirrors that each reflect half, it keeps an eighth of the background."""
     sides = np.array([[4.0, 0, 0], [0, 4.0, 0]])
-    walls = [surfaces_of(parallelogram(np.array([-2, -2, z]), sides), MIRROR, np.full(3, 0.5)) for z in (1.0, -1.0)]
+    walls = [make_surfaces(parallelogram(np.array([-2, -2, z]), sides), MIRROR, np.full(3, 0.5)) for z in (1.0, -1.0)]
     world = demo.world_of(claims.random_gaussians(0, np.random.default_rng(0)), around(*walls), np.ones(3))
     assert_allclose(shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]])), 0.125, rtol=CLOSED_FORM)
 
@@ -162,7 +166,7 @@ def test_after_three_surfaces_a_ray_sees_through_the_next():
 def test_a_ray_ends_below_a_ten_thousandth_in_its_brightest_channel():
     nobody = claims.random_gaussians(0, np.random.default_rng(0))
     for color, is_kept in (([1.1e-4, 0.0, 1e-5], True), ([0.9e-4, 0.9e-4, 1e-5], False)):
-        mirror = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL), MIRROR, np.array(color))
+        mirror = make_surfaces(parallelogram(np.array([-2.0, -2, 3]), WALL), MIRROR, np.array(color))
         seen = shade(demo.world_of(nobody, around(mirror), np.ones(3)), rays_of([[0, 0, 0]], [[0.0, 0, 1]]))
         assert_allclose(seen, [color if is_kept else [0, 0, 0]], rtol=CLOSED_FORM)
 
@@ -174,7 +178,7 @@ def test_glass_reflects_its_share_and_tints_what_it_lets_through():
     tint: red ``0.5 + 0.5 (0.04 (0.5 + 0.5 * 0.25) + 0.96 * 0.8 * 0.25)``.
     """
     veil = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.array([[1.0, 0, 0]]))
-    glass = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL[::-1]), GLASS, np.array([0.8, 0.6, 0.4]))
+    glass = make_surfaces(parallelogram(np.array([-2.0, -2, 3]), WALL[::-1]), GLASS, np.array([0.8, 0.6, 0.4]))
     world = demo.world_of(veil._replace(opacity_logits=np.zeros(1)), around(glass), np.array([0.25, 0.5, 0.75]))
     seen = shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]]))
     assert_allclose(seen, [[0.6085, 0.149, 0.1515]], rtol=1e-12)
@@ -186,7 +190,7 @@ def test_glass_reflects_its_share_and_tints_what_it_lets_through():
 def test_gaussians_in_front_of_a_mesh_cover_it_and_those_behind_it_do_not_count():
     front = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.array([[1.0, 0, 0]]))
     behind = front._replace(means=np.array([[0.0, 0, 4]]))
-    wall = surfaces_of(parallelogram(np.array([-4.0, -4, 3]), 2 * WALL), DIFFUSE, np.array([0.0, 0.0, 1.0]))
+    wall = make_surfaces(parallelogram(np.array([-4.0, -4, 3]), 2 * WALL), DIFFUSE, np.array([0.0, 0.0, 1.0]))
     rays = rays_of([[0, 0, 0], [0, 0, 0]], [[0.0, 0, 1], [0.9, 0, 1]])
     o = 1 / (1 + np.exp(-4))
     image = shade(demo.world_of(front, around(wall), BLACK), rays)
@@ -195,27 +199,27 @@ def test_gaussians_in_front_of_a_mesh_cover_it_and_those_behind_it_do_not_count(
 
 
 def test_a_wall_is_lit_by_the_cosine_and_dark_behind_another():
-    wall = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
+    wall = make_surfaces(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
     lamp = np.array([[1.0, 0.0, 2.0]])
     nobody = claims.random_gaussians(0, np.random.default_rng(0))
     rays = rays_of([[0, 0, 0]], [[0.0, 0, 1]])
     lit = shade(demo.world_of(nobody, around(wall, lights=lamp, ambient=0.2), BLACK), rays)
     assert_allclose(lit, 0.2 + 0.8 * np.sqrt(0.5), rtol=CLOSED_FORM)
-    screen = surfaces_of(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
+    screen = make_surfaces(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
     dark = shade(demo.world_of(nobody, around(wall, screen, lights=lamp, ambient=0.2), BLACK), rays)
     assert_allclose(dark, 0.2)
 
 
 def test_lamps_share_the_light_and_gaussians_have_no_cosine():
     """Lamps at 45 degrees and straight in front light a wall by ``0.2 + 0.8 (0.7071068 + 1) / 2``."""
-    wall = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
+    wall = make_surfaces(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
     lamps = np.array([[1.0, 0.0, 2.0], [0.0, 0.0, 0.5]])
     nobody, rays = claims.random_gaussians(0, np.random.default_rng(0)), rays_of([[0, 0, 0]], [[0.0, 0, 1]])
     world = demo.world_of(nobody, around(wall, lights=lamps, ambient=0.2), BLACK)
     assert_allclose(shade(world, rays), 0.8828427, atol=1e-7)
     points = np.array([[0.0, 0, 2.9]])
     assert_allclose(irradiance(world, points, None), 1, rtol=CLOSED_FORM)
-    screen = surfaces_of(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
+    screen = make_surfaces(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
     half = demo.world_of(nobody, around(screen, lights=lamps, ambient=0.2), BLACK)
     assert_allclose(irradiance(half, points, None), 0.6, rtol=CLOSED_FORM)
 
@@ -291,9 +295,9 @@ def test_a_light_in_a_faint_gaussian_is_taken():
         lit = around(lights=[[0.0, 0, 2]])
         if is_refused:
             with pytest.raises(InputError, match="lies inside Gaussian 0"):
-                surroundings.check_lights(lit, gaussians, "it")
+                check_lights(lit, gaussians, "it")
         else:
-            surroundings.check_lights(lit, gaussians, "it")
+            check_lights(lit, gaussians, "it")
 
 
 # --- a peer ---

@@ -8,7 +8,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.reflective.method import RECIPE
+from minisplat_ref.extensions.reflective.model import RECIPE
 from minisplat_ref.io.images import read_image
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import (

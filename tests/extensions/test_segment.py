@@ -12,10 +12,8 @@ from scipy.optimize import linprog
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.segment.assignment import belongs, labels
-from minisplat_ref.extensions.segment.maps import label_map
-from minisplat_ref.extensions.segment.render import paint
-from minisplat_ref.extensions.segment.votes import Votes, colored, count_votes
+from minisplat_ref.extensions.segment.commands import paint
+from minisplat_ref.extensions.segment.votes import Votes, assign_labels, belongs, colored, count_votes, label_map
 from minisplat_ref.io import read_image
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import load_ply, read_label, save_ply
@@ -80,7 +78,7 @@ def test_a_gaussian_that_is_hidden_or_outside_has_no_vote():
     camera = make_camera()
     votes = count_votes(gaussians, SPLATTING, [(camera, np.ones((camera.height, camera.width), int))], [1])
     assert_array_equal(votes.is_seen, [*[True] * votes.is_seen[:5].sum(), *[False] * (7 - votes.is_seen[:5].sum())])
-    assert_array_equal(labels(votes, 0.0)[-2:], [-1, -1])
+    assert_array_equal(assign_labels(votes, 0.0)[-2:], [-1, -1])
 
 
 def test_weights_that_are_no_opacity_are_refused(masked):
@@ -123,7 +121,7 @@ def test_labels_are_the_optimum_of_the_linear_programme(masked):
         votes = count_votes(gaussians, SPLATTING, [(camera, (mask == label).astype(int))], [1])
         found = belongs(votes, 1, 0.0)
         assert np.abs(w @ found - m).sum() == pytest.approx(solved.fun, rel=1e-9)
-        assert_array_equal(found, labels(votes, 0.0) == 1)
+        assert_array_equal(found, assign_labels(votes, 0.0) == 1)
     assert found.any() and not found.all()
 
 
@@ -140,7 +138,7 @@ HAND = Votes((0, 3, 8), np.array([[6.0, 2.0, 0.0, 1.0, 2.0], [4.0, 1.0, 0.0, 6.0
     ],
 )
 def test_the_bias_is_the_background_s(bias, expected):
-    assert_array_equal(labels(HAND, bias), expected)
+    assert_array_equal(assign_labels(HAND, bias), expected)
 
 
 def test_one_object_against_the_rest():
@@ -202,7 +200,9 @@ def label_command(*words):
 def test_labels_are_a_column_that_others_skip(folder, masked, capsys):
     gaussians, camera, mask = masked
     assert label_command("--out", "labelled.ply") == 0
-    expected = labels(count_votes(load_ply("run/point_cloud.ply"), SPLATTING, [(camera, mask)], [2, 5, 6, 9]), 0.0)
+    expected = assign_labels(
+        count_votes(load_ply("run/point_cloud.ply"), SPLATTING, [(camera, mask)], [2, 5, 6, 9]), 0.0
+    )
     column = load_ply("labelled.ply", load_labelled()).label
     assert_array_equal(column, expected)
     assert len(np.unique(column)) > 2

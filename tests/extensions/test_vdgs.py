@@ -12,23 +12,24 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.vdgs import modes
-from minisplat_ref.extensions.vdgs.gradient_checks import MODES, small_shared, stages
-from minisplat_ref.extensions.vdgs.method import (
+from minisplat_ref.extensions.vdgs.model import (
     CENTER,
+    MODES,
     NAME,
     RADIUS,
     TABLE,
     VIEW_DEPENDENT,
     as_seen,
+    both_plus,
+    both_times,
     levels_of,
-    n_outputs,
-)
-from minisplat_ref.extensions.vdgs.reference import (
     modulate,
     modulate_vjp,
     modulated_logits,
     modulated_logits_vjp,
+    n_outputs,
+    small_shared,
+    stages,
 )
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.mechanisms.networks.directions import directions, directions_vjp
@@ -45,7 +46,7 @@ from scenes import as_dtype, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 RENDERER = VIEW_DEPENDENT.renderer
-ALL_MODES = (*floats_study.MODES, modes.both_times, modes.both_plus)
+ALL_MODES = (*floats_study.MODES, both_times, both_plus)
 
 
 def logit(o):
@@ -135,7 +136,7 @@ def test_gradients_of_the_formulas(rng):
 
 def test_the_gradient_of_the_renderer(rng):
     """Of one mode that has everything; ``oracle gradients --extension vdgs`` checks the others."""
-    chosen = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), rng)[MODES.index(modes.both_times)]
+    chosen = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), rng)[MODES.index(both_times)]
     assert {TABLE, f"{NAME}_weights_0", "means", "cam_from_world_t"} <= chosen.inputs.keys()
     assert not {CENTER, RADIUS} & chosen.inputs.keys()
     case = jacobian_case(chosen)
@@ -143,8 +144,8 @@ def test_the_gradient_of_the_renderer(rng):
 
 
 def test_backends_agree(rng):
-    g, shared = make_gaussians(rng, 20, sh_degree=1), small_shared(modes.both_plus, 12, rng)
-    renderer = configure(find_recipe("vdgs"), modulation=modes.both_plus).representation.renderer
+    g, shared = make_gaussians(rng, 20, sh_degree=1), small_shared(both_plus, 12, rng)
+    renderer = configure(find_recipe("vdgs"), modulation=both_plus).representation.renderer
     v_image, view = rng.normal(size=(18, 24, 3)), view_from(make_camera())
     results = []
     for backend in (CPU, REFERENCE):
@@ -247,3 +248,22 @@ def test_a_baked_view_is_that_view(run_folder, tmp_path, capfd):
     ):
         assert main(["vdgs", "bake", *arguments, "--out", str(tmp_path / "no.ply")]) == 2
         assert expected in capfd.readouterr().err and not (tmp_path / "no.ply").exists()
+
+
+def test_the_pane(tmp_path):
+    arguments = ["vdgs/pane", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "pane")]
+    assert measure_claim(arguments) == 0
+    result = json.loads((tmp_path / "pane" / "result.json").read_text())
+    assert [record["arm"] for record in result["records"]] == [study.HARMONICS, study.TIMES, study.PLUS]
+    truth = study.make_pane(np.random.default_rng(0))
+    front = study.make_pane_scene(truth).train_views[23].camera
+    assert_allclose(study.true_opacities(truth, front)[12], study.F0, atol=0.01)
+
+
+def test_equal_floats(monkeypatch, scene):
+    monkeypatch.setattr("minisplat_ref.extensions.vdgs.model.N_ROWS", 16)
+    recipe = floats_study.arms(3)["colors_plus"]
+    assert floats_study.n_shared(scene, recipe) == 4 * 16 * 2 + 11 * 32 + 32 + 32 * 48 + 48 + 4
+    ours, theirs = (floats_study.measure(scene, 3, 50, arm, 0) for arm in ("colors_plus", floats_study.HARMONICS))
+    assert theirs["floats"] == 50 * 59 and 0 <= theirs["floats"] - ours["floats"] < 59
+    assert ours["gaussians"] == 14

@@ -13,8 +13,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
-from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
+from minisplat_ref.extensions.velocity.model import MOVING, MovingGaussians, means_at, means_at_vjp
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import load_ply, save_ply

@@ -15,8 +15,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.vr import foveation
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
-from minisplat_ref.extensions.vr.gradient_checks import stages
-from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
+from minisplat_ref.extensions.vr.model import BUFFER, HEADSET, stages
 from minisplat_ref.io.ply import read_label
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import Request

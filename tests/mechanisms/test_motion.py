@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_jacobian
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.velocity.reference import means_at
+from minisplat_ref.extensions.velocity.model import means_at
 from minisplat_ref.mechanisms.motion.field import (
     basis,
     choose_centers,

@@ -16,7 +16,7 @@ from minisplat_ref.extensions import extension
 from minisplat_ref.extensions.cuts import kernels as cut_kernels
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.geometry import losses as geometric_losses
-from minisplat_ref.extensions.micro import method as micro
+from minisplat_ref.extensions.micro import recipe as micro
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.loss_terms import loss_cases, loss_stage, own_terms

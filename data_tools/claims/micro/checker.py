@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import show, with_deviation
-from minisplat_ref.extensions.micro.method import collect_detail, trace
-from minisplat_ref.extensions.micro.reference import detail_map
+from minisplat_ref.extensions.micro.model import detail_map
+from minisplat_ref.extensions.micro.recipe import collect_detail, trace
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED, TITLE_COLOR
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, collect_gradients

@@ -17,7 +17,7 @@ from scipy.special import erf
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import show
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.negative.method import SIGNED
+from minisplat_ref.extensions.negative.model import SIGNED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import SPLATTING, Renderer, Request

@@ -15,9 +15,7 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import table_of
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.polygons.geometry import polygons_of
-from minisplat_ref.extensions.polygons.method import TRACED
-from minisplat_ref.extensions.polygons.ray_kernels import tree_of
+from minisplat_ref.extensions.polygons.model import TRACED, build_tree, make_polygons
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.rendering.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.types import Camera, Gaussians, Model, View, view_from
@@ -67,8 +65,8 @@ def measure(n: int, repeats: int) -> dict[str, dict[str, float | None]]:
     }
     found = {name: _row(renderer, backend, gaussians, view, repeats) for name, (renderer, backend) in ways.items()}
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    polygons = polygons_of(gaussians, opacities)
-    found["polygons"]["tree ms"] = 1e3 * kit.min_seconds(partial(tree_of, polygons, GSPLAT_MAIN), repeats)
+    polygons = make_polygons(gaussians, opacities)
+    found["polygons"]["tree ms"] = 1e3 * kit.min_seconds(partial(build_tree, polygons, GSPLAT_MAIN), repeats)
     found["polygons"]["error of float32"] = _error(gaussians, view)
     return found
 

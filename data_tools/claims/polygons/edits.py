@@ -25,9 +25,9 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import set_ticks, show, subplots, table_of
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.polygons.kernels import TRIANGLE, Fans, tree_of
-from minisplat_ref.extensions.polygons.method import TRACED
-from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, soup_of
+from minisplat_ref.extensions.polygons.kernels import TRIANGLE, Fans, build_tree
+from minisplat_ref.extensions.polygons.model import TRACED
+from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, make_soup
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
@@ -78,7 +78,7 @@ def round_trips(seed: int) -> dict[int, float]:
     gaussians.log_scales[::4, 1] = gaussians.log_scales[::4, 0]
     gaussians.log_scales[1::4, 1] -= 7
     for n_sides in SIDES:
-        soup = soup_of(gaussians, n_sides)
+        soup = make_soup(gaussians, n_sides)
         back = fit_flat_gaussians(soup.corners, soup.radii)
         again = rims(back.means, back.spans, soup.radii, n_sides)
         worst[n_sides] = float(np.abs(again - soup.corners).max() / np.abs(soup.corners).max())
@@ -92,7 +92,7 @@ def affine_errors(name: str, seed: int) -> dict[str, float]:
     """
     before, A = cloud(np.random.default_rng(seed)), MAPS[name]
     centre = np.array([0.0, 0, 4])
-    soup, shift = soup_of(before, 8), centre - A @ centre
+    soup, shift = make_soup(before, 8), centre - A @ centre
     corners = soup.corners @ A.T + shift
     after, _ = carry_gaussians(before, soup, corners, name)
     direct = deform(before, before.means @ A.T + shift, Deformation(A[None], np.zeros(N, int)))
@@ -128,7 +128,7 @@ def render_soup(gaussians: Gaussians, soup: Soup, corners: Floats) -> Floats:
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits[soup.rows]))
     fans = Fans(centres, corners - centres[:, None], soup.radii, opacities)
     colors = np.maximum(0, 0.5 + SH_C0 * gaussians.sh_dc[soup.rows])
-    tracer = tracer_of(TRIANGLE, tree_of(fans, GSPLAT_MAIN))
+    tracer = tracer_of(TRIANGLE, build_tree(fans, GSPLAT_MAIN))
     return tracer.blend(colors, pixel_rays(camera(), GSPLAT_MAIN), np.ones(3), GSPLAT_MAIN).image.reshape(SIZE, SIZE, 3)
 
 
@@ -171,7 +171,7 @@ def place_sheet(points: Floats) -> Floats:
 def bend_errors(n: int, angle: float) -> dict[str, float]:
     """Return the errors of a sheet of n by n splats that is bent by an angle: corners by both ways, and images."""
     gaussians = sheet(n)
-    soup = soup_of(gaussians, 8)
+    soup = make_soup(gaussians, 8)
     corners = place_sheet(bend(soup.corners, angle))
     centres, spans = fit_spans(corners, soup.radii)
     paper = by_gram_schmidt(corners, soup.radii)
@@ -219,7 +219,7 @@ def draw(result: dict[str, Any]) -> Figure:
     """Draw a bent sheet, as polygons and as Gaussians, beside both curves."""
     figure, panels = subplots((10.5, 2.9), 1, 4, gridspec_kw={"width_ratios": [1, 1, 1.4, 1.4]})
     gaussians, angle = sheet(USUAL_PER_SIDE), 180
-    soup = soup_of(gaussians, 8)
+    soup = make_soup(gaussians, 8)
     corners = place_sheet(bend(soup.corners, angle))
     fitting, _ = carry_gaussians(gaussians, soup, corners, "the bent sheet")
     images = {

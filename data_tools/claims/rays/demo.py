@@ -6,10 +6,15 @@ Camera frame and world are the same: x right, y down, z forward.
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.rays.lights import World
-from minisplat_ref.extensions.rays.method import tracer_for, whiten_model
-from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.lights import (
+    MIRROR,
+    Surroundings,
+    World,
+    concatenate_surfaces,
+    make_surfaces,
+    parallelogram,
+)
+from minisplat_ref.extensions.rays.model import make_tracer, whiten_model
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Floats, Gaussians, Model
 
@@ -67,12 +72,12 @@ def camera_of(width: int = 240, height: int = 180) -> Camera:
 
 def world_of(gaussians: Gaussians, surroundings: Surroundings, background: Floats) -> World:
     """Return Gaussians and their surroundings as a world for the kernels."""
-    tracer = tracer_for(whiten_model(Model(gaussians)), GSPLAT_MAIN, CPU)
+    tracer = make_tracer(whiten_model(Model(gaussians)), GSPLAT_MAIN, CPU)
     return World(gaussians, tracer, surroundings, background, GSPLAT_MAIN)
 
 
 def demo_world() -> World:
     """Return the whole scene."""
-    mirror = surfaces_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
+    mirror = make_surfaces(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
     around = Surroundings(LAMP[None], 0.35, BIAS, concatenate_surfaces([mirror]))
     return world_of(concatenate_populations(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))

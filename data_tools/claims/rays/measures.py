@@ -11,11 +11,16 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import show, subplots, table_of
 from data_tools.claims.rays import demo
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.rays.kernels import tree_of
-from minisplat_ref.extensions.rays.lights import shade, visibility
-from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
-from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.lights import (
+    MIRROR,
+    Surroundings,
+    concatenate_surfaces,
+    make_surfaces,
+    parallelogram,
+    shade,
+    visibility,
+)
+from minisplat_ref.extensions.rays.model import TRACED, build_tree, make_tracer, whiten_model
 from minisplat_ref.interface.palette import BLUE, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.orders import Sorted, composite_hits
@@ -95,7 +100,7 @@ def mirror_difference(n: int, seed: int) -> float:
     gaussians.means[:, 2] -= 10  # behind the camera, which sees them only in the mirror
     z = 1.5
     sides = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
-    wall = surfaces_of(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
+    wall = make_surfaces(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
     world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenate_surfaces([wall])), BLACK)
     in_mirror = shade(world, pixel_rays(camera, GSPLAT_MAIN))
     flip = np.diag([1.0, 1.0, -1.0])
@@ -215,12 +220,12 @@ def speed(n: int, repeats: int) -> dict[str, float]:
         backward = kit.min_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
     whitened = whiten_model(Model(gaussians))
-    result["tree ms"] = 1e3 * kit.min_seconds(partial(tree_of, whitened, GSPLAT_MAIN), repeats)
+    result["tree ms"] = 1e3 * kit.min_seconds(partial(build_tree, whitened, GSPLAT_MAIN), repeats)
     result["hits per ray"] = output.n_pairs / n_pixels
     few = pixel_rays(demo.camera_of(40, 22), GSPLAT_MAIN)
     colors = np.clip(0.5 + gaussians.sh_dc.astype(np.float64), 0, 1)
     exact, traced = (
-        tracer_for(some, GSPLAT_MAIN, backend).blend(colors, few, BLACK, GSPLAT_MAIN).image
+        make_tracer(some, GSPLAT_MAIN, backend).blend(colors, few, BLACK, GSPLAT_MAIN).image
         for some, backend in ((whiten_model(Model(wide)), REFERENCE), (whitened, CPU))
     )
     return {**result, "error of float32": float(np.abs(traced.astype(np.float32) - exact).max())}

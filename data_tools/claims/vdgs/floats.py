@@ -15,8 +15,14 @@ from data_tools.claims.kit.figures import group, plot_deviations, subplots
 from data_tools.claims.kit.tables import first, spread, table
 from data_tools.claims.vdgs.pane import floats_of
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.vdgs import modes
-from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
+from minisplat_ref.extensions.vdgs.model import (
+    VDGS,
+    VIEW_DEPENDENT,
+    colors_plus,
+    colors_times,
+    opacity_plus,
+    opacity_times,
+)
 from minisplat_ref.interface.palette import BLUE
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
@@ -26,7 +32,7 @@ from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Scene
 
 HARMONICS = "harmonics"
-MODES = (modes.opacity_times, modes.opacity_plus, modes.colors_times, modes.colors_plus)
+MODES = (opacity_times, opacity_plus, colors_times, colors_plus)
 FLOATS = 59  # of a Gaussian with harmonics of degree 3
 
 

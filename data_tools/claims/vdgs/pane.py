@@ -25,8 +25,7 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import subplots, summarise
 from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.datasets.synthetic.cameras import look_at
-from minisplat_ref.extensions.vdgs import modes
-from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT, as_seen
+from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, as_seen, opacity_plus
 from minisplat_ref.interface.palette import BLUE, OCHRE, RED
 from minisplat_ref.mechanisms.networks.directions import directions
 from minisplat_ref.mechanisms.networks.networks import COMPILED
@@ -122,7 +121,7 @@ def arms(iterations: int) -> dict[str, Recipe]:
     recipes = {
         HARMONICS: GS_ACCEL,
         TIMES: ours,
-        PLUS: configure(ours, modulation=modes.opacity_plus),
+        PLUS: configure(ours, modulation=opacity_plus),
     }
     return {name: kit.drop_events(scale_recipe(recipe, iterations)) for name, recipe in recipes.items()}
 

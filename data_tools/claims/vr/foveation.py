@@ -14,7 +14,7 @@ from data_tools.claims.kit.figures import subplots
 from data_tools.claims.vr import queues
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
-from minisplat_ref.extensions.vr.method import BUFFER
+from minisplat_ref.extensions.vr.model import BUFFER
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io import load_ply

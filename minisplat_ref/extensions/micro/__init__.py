@@ -2,7 +2,7 @@
 
 This follows Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that fits
 an edge in one place is wrong next to it. There are three changes to 3DGS
-(:mod:`minisplat_ref.extensions.micro.method`):
+(:mod:`minisplat_ref.extensions.micro.recipe`):
 
 - *Trace penalty.* ``L = L_photometric + lambda mean_k max(tr(Sigma_k) / tau - 1, 0)`` with
   ``tr(Sigma) = s0^2 + s1^2 + s2^2`` and ``d tr / d s_j = 2 s_j``. During densification a Gaussian with a penalty is
@@ -31,7 +31,7 @@ out is LPIPS in the loss, whose weights are not ours to ship.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.micro.gradient_checks import stages
-from minisplat_ref.extensions.micro.method import MICRO
+from minisplat_ref.extensions.micro.model import stages
+from minisplat_ref.extensions.micro.recipe import MICRO
 
 EXTENSION = Extension("micro", recipes=(MICRO,), stages=stages)

@@ -4,10 +4,10 @@ This follows Multi-Scale 3D Gaussian Splatting, Yan et al. 2023, arXiv 2311.1708
 a scene are smaller than a pixel. 3DGS widens each to about one, so that they cover too much, and as many are sorted as
 for a large image. Here a scene has several levels, and a view renders at each place the one that suits it:
 
-- *Levels* (:mod:`minisplat_ref.extensions.multi_scale.levels`). For images of 1/F^l of the size, the Gaussians that
+- *Levels* (:mod:`minisplat_ref.extensions.multi_scale.model`). For images of 1/F^l of the size, the Gaussians that
   would cover fewer than four pixels, ``S = 2 sqrt(2 ln(255 o)) s f / z``, are sorted into cubes as large as a pixel
   there, and each cube becomes one Gaussian with the moments of its members that stops as much light.
-- *Selection* (:mod:`minisplat_ref.extensions.multi_scale.reference`). A Gaussian is rendered where its own cube
+- *Selection* (:mod:`minisplat_ref.extensions.multi_scale.model`). A Gaussian is rendered where its own cube
   covers less than a pixel and its parent's at least one: ``w f / z < 1 <= w' f / z``.
 - *Training.* After densification the levels are inserted, for images of 1/4, 1/16 and 1/64 of the size; in every
   fourth iteration a smaller image joins the loss, with the weight 0.1.
@@ -32,6 +32,7 @@ not.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.multi_scale import build
-from minisplat_ref.extensions.multi_scale.method import LEVELS, MULTI_SCALE
+from minisplat_ref.extensions.multi_scale.model import LEVELS
+from minisplat_ref.extensions.multi_scale.recipe import MULTI_SCALE
 
 EXTENSION = Extension("multi-scale", recipes=(MULTI_SCALE,), representation=LEVELS, commands=(build,))

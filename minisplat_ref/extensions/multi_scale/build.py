@@ -8,8 +8,8 @@ import numpy as np
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, FACTOR, N_LEVELS, finest_densities
+from minisplat_ref.extensions.multi_scale.model import Plan, add_levels, level_zero
+from minisplat_ref.extensions.multi_scale.recipe import COVERAGE_MIN, FACTOR, N_LEVELS, finest_densities
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import further_properties, load_ply, save_ply
 
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     levels = level_zero(gaussians, np.random.default_rng(0))
     if len(gaussians.means) > 0:
         plan = Plan(args.factor, args.levels, args.min_coverage)
-        levels = with_levels(levels, finest_densities(gaussians.means, cameras), plan, GSPLAT_MAIN)
+        levels = add_levels(levels, finest_densities(gaussians.means, cameras), plan, GSPLAT_MAIN)
     save_ply(args.out, levels, Label("multi-scale"))
     added = len(levels.means) - len(gaussians.means)
     print(f"{added:,} coarser Gaussians beside {len(gaussians.means):,} in {args.out}")

@@ -1,10 +1,10 @@
 """From the depth maps of views to the points at which Gaussians are inserted.
 
 Each map is smoothed along its photograph. A pixel stays if enough other views agree on its depth; the mean of all that
-agree is its depth from then on. Those of the near and of the far level are taken on a grid whose stride is the level's,
-each with the normal of its smoothed map and with the radius ``r = D / f * stride``, which is the spacing of the grid on
-the surface. A point within the radius of an older one is left out, so surfaces that several views show are covered
-once.
+agree is its depth from then on. A smoothed histogram of all these depths separates near, middle and far. Pixels of the
+near and of the far level are taken on a grid whose stride is the level's, each with the normal of its smoothed map and
+with the radius ``r = D / f * stride``, which is the spacing of the grid on the surface. A point within the radius of an
+older one is left out, so surfaces that several views show are covered once.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,87 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from minisplat_ref.extensions.mvg.reference import depth_cuts, levels_of, on_grid
 from minisplat_ref.mechanisms.depth_maps.bilateral import BilateralWidths, joint_bilateral_depth
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances, agree, nearest_views, unproject
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.types import Bools, Floats, Ints
 
+N_BINS = 512
+BANDWIDTH = 0.9  # Silverman's factor
+HALF = 0.5  # of the peak: denser depths are the middle
+NEAR, MIDDLE, FAR = 0, 1, 2
 WIDTHS = BilateralWidths(radius=2, spatial=1.0, color=0.1)
+
+
+class Density(NamedTuple):
+    """The distribution of depths."""
+
+    depths: Floats
+    """[B] middles of the bins, world units."""
+    values: Floats
+    """[B] per world unit; their integral is 1."""
+
+
+def depth_density(depths: Floats) -> Density:
+    """Return the kernel density of depths, by convolution in the Fourier domain.
+
+    With the histogram h, and the Gaussian kernel whose width is Silverman's::
+
+        p = irfft(rfft(h) exp(-(2 pi f sigma)^2 / 2)),   sigma = 0.9 min(std, IQR / 1.34) P^(-1/5)
+
+    Parameters
+    ----------
+    depths : ndarray of shape (P,)
+        World units, not all equal.
+    """
+    low, high = float(depths.min()), float(depths.max())
+    quartiles = np.quantile(depths, [0.25, 0.75])
+    spread = min(float(depths.std()), float(quartiles[1] - quartiles[0]) / 1.34) or float(depths.std())
+    sigma = BANDWIDTH * spread * len(depths) ** -0.2
+    margin = 4 * sigma  # so that what wraps around is zero
+    h, edges = np.histogram(depths, N_BINS, (low - margin, high + margin))
+    width = edges[1] - edges[0]
+    frequencies = np.fft.rfftfreq(N_BINS, width)  # per world unit
+    smooth = np.fft.irfft(np.fft.rfft(h) * np.exp(-0.5 * (2 * np.pi * frequencies * sigma) ** 2), N_BINS)
+    return Density((edges[:-1] + edges[1:]) / 2, np.maximum(smooth, 0) / (len(depths) * width))
+
+
+def depth_cuts(depths: Floats) -> tuple[float, float]:
+    """Return the depths between near and middle, and between middle and far.
+
+    The middle is the interval around the highest peak of the density in which it is above half of it. The quantiles at
+    which depths are cut adapt to the scene in this way: a wall behind an object has a narrow peak, and all of the
+    object is near.
+
+    Parameters
+    ----------
+    depths : ndarray of shape (P,)
+        World units, at least one.
+    """
+    if np.ptp(depths) == 0:
+        return float(depths[0]), float(depths[0])
+    density = depth_density(depths)
+    peak = int(np.argmax(density.values))
+    is_low = density.values < HALF * density.values[peak]
+    before, after = np.flatnonzero(is_low[:peak]), np.flatnonzero(is_low[peak:])
+    first = before[-1] if len(before) else 0
+    last = peak + after[0] if len(after) else N_BINS - 1
+    return float(density.depths[first]), float(density.depths[last])
+
+
+def levels_of(depths: Floats, cuts: tuple[float, float]) -> Ints:
+    """Return 0, 1 or 2 for each depth: near, middle, far."""
+    near, far = cuts
+    return np.where(depths < near, NEAR, np.where(depths > far, FAR, MIDDLE))
+
+
+def on_grid(shape: tuple[int, int], stride: int, corner: tuple[int, int]) -> Bools:
+    """Return which pixels [H, W] are those of every ``stride``-th row and column, from a corner on; none for 0."""
+    chosen = np.zeros(shape, bool)
+    if stride:
+        chosen[corner[0] % stride :: stride, corner[1] % stride :: stride] = True
+    return chosen
 
 
 class Photographed(NamedTuple):
@@ -86,7 +159,7 @@ def propose(views: Sequence[Photographed], rules: Rules, rng: np.random.Generato
         Their depths as they shall be tested; :func:`smooth_map` first.
     rules : Rules
     rng : Generator
-        Draws where each view's grids begin.
+        Of the places where each view's grids begin.
     """
     fused = agreed_depths(views, rules)
     known = np.concatenate([depth[depth > 0] for depth in fused])

@@ -6,12 +6,12 @@ difference of two, a wide one minus a narrow one in its middle, has a hollow, an
     f_c = (N(m0, S0) - c N(m1, S1)) / (1 - c),   0 <= c < 1
 
 which is a density exactly if ``c <= min_x N(m0, S0) / N(m1, S1)``. That minimum is above zero only where the negative
-Gaussian is the narrower one (:mod:`minisplat_ref.extensions.negative.reference`). The abstract speaks of densities that
+Gaussian is the narrower one (:mod:`minisplat_ref.extensions.negative.model`). The abstract speaks of densities that
 are *divided*; the construction is this weighted difference, and the quotient only appears in its bound.
 
 In a scene the negative component is a Gaussian whose *colour* is negative; its opacity stays between 0 and 1, and the
 compositing is that of 3DGS, ``C = sum_i w_i c_i + T_end b``. So one thing changes in the renderer: the colour is
-``c = 0.5 + sum_k c_k Y_k(d)``, without the ``max(0, .)`` (:mod:`minisplat_ref.extensions.negative.method`). A fraction
+``c = 0.5 + sum_k c_k Y_k(d)``, without the ``max(0, .)`` (:mod:`minisplat_ref.extensions.negative.model`). A fraction
 of the Gaussians starts negative. Where all colours are positive the image is that of 3DGS, bit for bit.
 
 Four consequences are worth knowing:
@@ -35,7 +35,7 @@ components pair up, or not, as the photographs require.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.negative.method import NEGATIVE, SIGNED
+from minisplat_ref.extensions.negative.model import NEGATIVE, SIGNED
 
 EXTENSION = Extension("negative", recipes=(NEGATIVE,), representation=SIGNED)
 """Gaussians of either sign with their renderer, the recipe that trains them."""

@@ -29,8 +29,7 @@ footprints.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.pixel_order.gradient_checks import stages
-from minisplat_ref.extensions.pixel_order.method import ORDERED, PIXEL_ORDER
+from minisplat_ref.extensions.pixel_order.model import ORDERED, PIXEL_ORDER, stages
 
 EXTENSION = Extension(
     "pixel-order",

@@ -12,7 +12,7 @@ The ray of each pixel takes alpha where it hits the polygon:
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
 (``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with a polygon instead of an ellipsoid
-(:mod:`.ray_kernels`, in NumPy :mod:`.reference`). An edited polygon may be bent, and then a ray hits the triangles
+(:mod:`.ray_kernels`, in NumPy :mod:`.model`). An edited polygon may be bent, and then a ray hits the triangles
 between its centre and two neighbouring corners (:mod:`.kernels`); of a flat one, both give the same hits.
 
 A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The corners of an edited polygon are fitted by
@@ -39,15 +39,14 @@ plane, copies are taken in the order of their rows, and others in the order in w
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.polygons import edit, export
-from minisplat_ref.extensions.polygons.gradient_checks import stages
-from minisplat_ref.extensions.polygons.method import POLYGONS, TRACED
+from minisplat_ref.extensions.polygons import commands
+from minisplat_ref.extensions.polygons.model import POLYGONS, TRACED, stages
 
 EXTENSION = Extension(
     "polygons",
     recipes=(POLYGONS,),
     representation=TRACED,
-    commands=(export, edit),
+    commands=(commands,),
     stages=stages,
 )
 """Flat Gaussians in polygons, the recipe that trains them, two commands that edit them."""

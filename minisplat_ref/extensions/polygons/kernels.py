@@ -22,10 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.polygons.geometry import Polygons
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, select
-from minisplat_ref.mechanisms.meshes.fans import rims
 from minisplat_ref.mechanisms.rays.bvh import build
 from minisplat_ref.mechanisms.rays.kernels import RayResponse
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
@@ -49,14 +47,7 @@ class Fans(NamedTuple):
     """[N] in [0, 1]."""
 
 
-def fans_of(polygons: Polygons) -> Fans:
-    """Return the fans of regular polygons."""
-    with np.errstate(invalid="ignore"):
-        spokes = rims(np.zeros_like(polygons.means), polygons.spans, polygons.radii, polygons.n_sides)
-    return Fans(polygons.means, spokes, polygons.radii, polygons.opacities)
-
-
-def tree_of(fans: Fans, conventions: Conventions) -> RayTree:
+def build_tree(fans: Fans, conventions: Conventions) -> RayTree:
     """Return the triangles of fans with their tree; fans that are too faint, empty or not finite are left out."""
     n, n_sides = fans.spokes.shape[:2]
     corners = fans.centres[:, None] + fans.spokes
@@ -140,7 +131,7 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return (-x, -y, -z), (t * x, t * y, t * z), (-b1 * x, -b1 * y, -b1 * z, -b2 * x, -b2 * y, -b2 * z)
 
 
-def _spans_of(tree: RayTree, v_edges: Floats) -> Floats:
+def _sum_spans(tree: RayTree, v_edges: Floats) -> Floats:
     """Return the gradient of the spans [N, 3, 2] from those of the triangles' edges [N', 6].
 
     The edges of triangle j are ``r S (cos phi, sin phi)^T`` at the angles ``phi_j`` and ``phi_j+1``.
@@ -155,5 +146,5 @@ def _spans_of(tree: RayTree, v_edges: Floats) -> Floats:
     return v_spans
 
 
-TRIANGLE = RayResponse(meet, meet_vjp, 6, _spans_of)
+TRIANGLE = RayResponse(meet, meet_vjp, 6, _sum_spans)
 """A triangle of the fan of a flat Gaussian."""

@@ -1,4 +1,4 @@
-"""One ray and one polygon as kernels read them, and the tree of a population: the formulas of :mod:`.reference`.
+"""One ray and one polygon as kernels read them: the formulas of :mod:`.model`.
 
 A polygon is tested as a whole: one plane, and the half-planes of its n edges, whose normals follow from each other by a
 rotation of ``2 pi / n``. Its triangles, eight times as many rows for an octagon, are needed once a mesh was edited
@@ -7,12 +7,9 @@ rotation of ``2 pi / n``. Its triangles, eight times as many rows for an octagon
 
 import numpy as np
 
-from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.polygons.geometry import Polygons
-from minisplat_ref.extensions.polygons.kernels import cross, dot, fans_of
+from minisplat_ref.extensions.polygons.kernels import cross, dot
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
-from minisplat_ref.mechanisms.rays.bvh import build
 from minisplat_ref.mechanisms.rays.kernels import RayResponse
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
 from minisplat_ref.types import Floats
@@ -23,30 +20,23 @@ CENTRE, SPAN_A, SPAN_B, U, V, NORMAL = 7, 10, 13, 16, 19, 22  # U = S_a / |S_a|^
 N_COLUMNS = 25
 
 
-def tree_of(polygons: Polygons, conventions: Conventions) -> RayTree:
-    """Return the polygons with their tree; those that are too faint, empty or not finite are left out."""
-    fans, n = fans_of(polygons), polygons.n_sides
-    corners = fans.centres[:, None] + fans.spokes  # [N, n, 3]
-    is_seen = (polygons.radii > 0) & (polygons.opacities >= max(conventions.alpha_min, np.finfo(np.float64).tiny))
+def make_records(means: Floats, spans: Floats, radii: Floats, opacities: Floats, n_sides: int) -> Floats:
+    """Return the records [N, N_COLUMNS] of polygons of one number of sides; spans [N, 3, 2] are above 0."""
+    S_a, S_b, n = spans[:, :, 0], spans[:, :, 1], n_sides
     with np.errstate(over="ignore"):
-        squares = np.sum(polygons.spans**2, axis=1)  # [N, 2]
-    seen = np.flatnonzero(is_seen & np.isfinite(corners).all(axis=(1, 2)) & (squares > 0).all(axis=1))
-    tree = build(corners[seen].min(axis=1), corners[seen].max(axis=1))
-    ids = seen[tree.rows]
-    S_a, S_b = polygons.spans[ids, :, 0], polygons.spans[ids, :, 1]
-    records = np.empty((len(ids), N_COLUMNS))
-    records[:, OPACITY] = polygons.opacities[ids]
+        squares = np.sum(spans**2, axis=1)  # [N, 2]
+    records = np.empty((len(means), N_COLUMNS))
+    records[:, OPACITY] = opacities
     records[:, N_SIDES] = n
-    records[:, INNER] = polygons.radii[ids] * np.cos(np.pi / n)
+    records[:, INNER] = radii * np.cos(np.pi / n)
     records[:, FIRST:CENTRE] = [np.cos(np.pi / n), np.sin(np.pi / n), np.cos(2 * np.pi / n), np.sin(2 * np.pi / n)]
-    records[:, CENTRE:SPAN_A] = polygons.means[ids]
+    records[:, CENTRE:SPAN_A] = means
     records[:, SPAN_A:SPAN_B] = S_a
     records[:, SPAN_B:U] = S_b
-    records[:, U:V] = S_a / squares[ids, :1]
-    records[:, V:NORMAL] = S_b / squares[ids, 1:]
+    records[:, U:V] = S_a / squares[:, :1]
+    records[:, V:NORMAL] = S_b / squares[:, 1:]
     records[:, NORMAL:] = np.cross(S_a, S_b)
-    parts = np.zeros(len(ids), np.int32)
-    return RayTree(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(polygons.means))
+    return records
 
 
 @scalar
@@ -109,12 +99,12 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return v_m, (-t * v_m[0], -t * v_m[1], -t * v_m[2]), v_spans
 
 
-def _spans_of(tree: RayTree, v_rows: Floats) -> Floats:
+def _sum_spans(tree: RayTree, v_rows: Floats) -> Floats:
     """Return the gradient of the spans [N, 3, 2] from those of the rows [N', 6], each of which is one polygon."""
     v: Floats = np.zeros((tree.n, 3, 2))
     v[tree.gaussian_ids] = np.swapaxes(v_rows.reshape(-1, 2, 3), 1, 2)
     return v
 
 
-POLYGON = RayResponse(meet, meet_vjp, 6, _spans_of)
+POLYGON = RayResponse(meet, meet_vjp, 6, _sum_spans)
 """A flat Gaussian in its polygon."""

@@ -50,7 +50,7 @@ class Soup(NamedTuple):
     """[M, n, 3] world frame."""
 
 
-def soup_of(gaussians: Gaussians, n_sides: int) -> Soup:
+def make_soup(gaussians: Gaussians, n_sides: int) -> Soup:
     """Return the polygons of a model, of those Gaussians that have one."""
     flat = flatten(gaussians.means, gaussians.quats, gaussians.log_scales)
     radii = opacity_radii(gaussians.opacity_logits)
@@ -69,7 +69,7 @@ def save_soup(path: str | Path, gaussians: Gaussians, n_sides: int) -> Soup:
     """
     if not 3 <= n_sides <= SIDES_MAX:
         raise InputError(f"a polygon has 3 to {SIDES_MAX} sides, not {n_sides}")
-    soup = soup_of(gaussians, n_sides)
+    soup = make_soup(gaussians, n_sides)
     if len(soup.rows) == 0:
         raise InputError(f"none of the {len(gaussians.means):,} Gaussians is opaque enough to have a polygon")
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits[soup.rows].astype(np.float64)))

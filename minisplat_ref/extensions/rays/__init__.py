@@ -31,8 +31,7 @@ alias. Shadows, mirrors and glass have no gradient. ``docs/FAMILY.md`` has the m
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.rays import render
-from minisplat_ref.extensions.rays.gradient_checks import stages
-from minisplat_ref.extensions.rays.method import RAYS, TRACED
+from minisplat_ref.extensions.rays.model import RAYS, TRACED, stages
 
 EXTENSION = Extension("rays", recipes=(RAYS,), representation=TRACED, commands=(render,), stages=stages)
 """Ray-traced Gaussians, the recipe that trains them, a command that lights them."""

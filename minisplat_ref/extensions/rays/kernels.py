@@ -1,4 +1,4 @@
-"""One ray and one 3D Gaussian as kernels read them, and the tree of a population: the formulas of :mod:`.reference`.
+"""One ray and one 3D Gaussian as kernels read them: the formulas of :mod:`.model`.
 
 The loops, from a ray's way through the tree to the gradient, are those of ``mechanisms.rays.traversal`` and
 ``mechanisms.rays.kernels``.
@@ -6,13 +6,10 @@ The loops, from a ray's way through the tree to the gradient, are those of ``mec
 
 import numpy as np
 
-from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.rays.geometry import Whitened
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import select
-from minisplat_ref.mechanisms.rays.bvh import SLACK, build
 from minisplat_ref.mechanisms.rays.kernels import RayResponse
-from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
+from minisplat_ref.mechanisms.rays.traversal import RayTree
 from minisplat_ref.types import Floats
 
 REACH, MEAN, MAP = 1, 2, 5  # columns of a record beside the opacity
@@ -95,25 +92,3 @@ def _maps_of(tree: RayTree, v_maps: Floats) -> Floats:
 
 RESPONSE = RayResponse(meet, meet_vjp, 9, _maps_of)
 """A 3D Gaussian where its density on the ray is greatest."""
-
-
-def tree_of(gaussians: Whitened, conventions: Conventions) -> RayTree:
-    """Return Gaussians with their tree, without those that are too faint or not finite."""
-    # Half-extents of the ellipsoid |M x|^2 = q: Sigma = M^-1 M^-T, and row i of M is R_i / s_i.
-    least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        reaches = 2 * np.log(gaussians.opacities / least)  # q
-        inverse_variances = np.sum(gaussians.maps**2, axis=2)  # [N, 3] 1 / s^2
-        axes = gaussians.maps / inverse_variances[:, :, None]  # [N, 3, 3] s_i R_i
-        half = np.sqrt(reaches[:, None] * np.sum(axes**2, axis=1))  # [N, 3]
-        is_finite = np.isfinite(gaussians.means).all(axis=1) & np.isfinite(half).all(axis=1)
-    seen = np.flatnonzero(is_finite & np.isfinite(inverse_variances).all(axis=1) & (reaches >= 0))
-    tree = build(gaussians.means[seen] - half[seen], gaussians.means[seen] + half[seen])
-    ids = seen[tree.rows]
-    records = np.empty((len(ids), N_COLUMNS))
-    records[:, OPACITY] = gaussians.opacities[ids]
-    records[:, REACH] = reaches[ids] + SLACK
-    records[:, MEAN:MAP] = gaussians.means[ids]
-    records[:, MAP:] = gaussians.maps[ids].reshape(-1, 9)
-    parts = np.zeros(len(ids), np.int32)
-    return RayTree(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(gaussians.means))

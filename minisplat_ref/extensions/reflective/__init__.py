@@ -33,8 +33,7 @@ as the background of the image.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.reflective.gradient_checks import stages
-from minisplat_ref.extensions.reflective.method import RECIPE, SHADED
+from minisplat_ref.extensions.reflective.model import RECIPE, SHADED, stages
 
 EXTENSION = Extension("reflective", recipes=(RECIPE,), representation=SHADED, stages=stages)
 """Surfels with materials, the recipe that trains them."""

@@ -2,7 +2,7 @@
 
 This follows FlashSplat: 2D to 3D Gaussian Splatting Segmentation Solved Optimally (2024), arXiv 2409.08270. Nothing is
 trained. Of a finished model, each Gaussian counts the weights with which it is blended into the pixels of each label
-(:mod:`.votes`), and takes the label with most of them, after a bias to the background (:mod:`.assignment`):
+(:mod:`.votes`), and takes the label with most of them, after a bias to the background:
 
     A_e(i) = sum of w_i(p) over the pixels p of label e,   a_e = A_e / sum_f A_f
     label(i) = argmax_e a_e + gamma [e = 0]
@@ -29,7 +29,6 @@ Left out is the making of masks: there is no tracker and no network here.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.segment import label, render
+from minisplat_ref.extensions.segment import commands
 
-EXTENSION = Extension("segment", commands=(label, render))
-"""Two commands."""
+EXTENSION = Extension("segment", commands=(commands,))

@@ -28,8 +28,7 @@ counts; the code holds that constant. Distortion has the square of the code, not
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.surfels.gradient_checks import stages
-from minisplat_ref.extensions.surfels.method import RECIPE
+from minisplat_ref.extensions.surfels.model import RECIPE, stages
 from minisplat_ref.mechanisms.surfels.discs import DISCS
 
 EXTENSION = Extension("surfels", recipes=(RECIPE,), representation=DISCS, stages=stages)

@@ -3,13 +3,13 @@
 This follows VDGS, Malarz et al. 2023, arXiv 2312.13729. Spherical harmonics let a colour depend on the direction of
 view, and nothing lets an opacity. Here a small network reads the direction d from which a Gaussian is seen, and the
 multi-resolution hash encoding E of its centre, and its output y changes the opacity o, the coefficients c_k of colour,
-or both (:mod:`.method`, :mod:`.reference`):
+or both (:mod:`.model`):
 
     y = MLP([d, E(mu)]),   d = (mu - camera) / |mu - camera|
     o' = o (1 + y)  or  o + y,   c_k' = c_k (1 + y_k)  or  c_k + y_k
 
 ``--set modulation=opacity_times`` is the default; ``opacity_plus``, ``colors_times`` and ``colors_plus`` are the other
-published modes, ``both_times`` and ``both_plus`` change opacity and colour (:mod:`.modes`).
+published modes, ``both_times`` and ``both_plus`` change opacity and colour.
 
     minisplat-ref train SCENE --recipe vdgs --set modulation=colors_plus --out runs/glossy
     minisplat-ref vdgs bake runs/glossy --view 0003 --out seen.ply
@@ -31,8 +31,7 @@ from typing import Any
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.vdgs import bake
-from minisplat_ref.extensions.vdgs.gradient_checks import stages
-from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT
+from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, stages
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply
 

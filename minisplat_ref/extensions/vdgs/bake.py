@@ -29,8 +29,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         It is no run of this recipe that has ended, or has no such view; a file alone has no network.
     """
-    from minisplat_ref.extensions.vdgs.method import VDGS, VIEW_DEPENDENT, as_seen
-    from minisplat_ref.extensions.vdgs.modes import opacity_times
+    from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, as_seen, opacity_times
     from minisplat_ref.io import viewpoints
     from minisplat_ref.io.checkpoint import load_checkpoint
     from minisplat_ref.io.frames import place_camera, return_fields

@@ -6,9 +6,9 @@ view is
 
     mu(t) = mu + t nu
 
-and everything else stays as it is (:mod:`minisplat_ref.extensions.velocity.reference`). Velocities start at zero, so
-that an untrained model is a static one. Times are those of the views, ``time`` in a transforms.json; they are 0 where a
-scene has none, which leaves the velocities without a gradient.
+and everything else stays as it is (:mod:`.model`). Velocities start at zero, so that an untrained model is a static
+one. Times are those of the views, ``time`` in a transforms.json; they are 0 where a scene has none, which leaves the
+velocities without a gradient.
 
 Left out are rotations and colours that change, and motion that is not straight, the subject of 4DGS. No single paper is
 followed; linear motion is the first-order case of all of them.
@@ -20,6 +20,6 @@ followed; linear motion is the first-order case of all of them.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.velocity import freeze
-from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY
+from minisplat_ref.extensions.velocity.model import MOVING, VELOCITY
 
 EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING, commands=(freeze,))

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.extensions.velocity.method import MovingGaussians, still_at
+from minisplat_ref.extensions.velocity.model import MovingGaussians, still_at
 from minisplat_ref.io.ply import load_ply, save_ply
 
 

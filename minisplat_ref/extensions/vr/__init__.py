@@ -3,9 +3,9 @@
 This follows VRSplat, Tu et al. 2025, arXiv 2505.10144, which combines three methods, so that a headset shows few
 Gaussians without popping and without stretched edges: Mini-Splatting's small model; StopThePop's order and Optimal
 Projection (:mod:`minisplat_ref.mechanisms.tangent.planes`, which the extension ``pixel-order`` uses on their own); and
-foveated rendering (:mod:`minisplat_ref.extensions.vr.foveation`). As in the paper, the recipe ``vr-fine-tuning`` trains
-a finished model of Mini-Splatting for 5,000 iterations with the footprints and the order with which it is rendered, and
-changes no number of Gaussians; ``vr`` is Mini-Splatting2 with them from the start.
+foveated rendering (:mod:`.foveation`). As in the paper, the recipe ``vr-fine-tuning`` trains a finished model of
+Mini-Splatting for 5,000 iterations with the footprints and the order with which it is rendered, and changes no number
+of Gaussians; ``vr`` is Mini-Splatting2 with them from the start.
 
     minisplat-ref train SCENE --recipe mini-splatting --out runs/few
     minisplat-ref train SCENE --recipe vr-fine-tuning --init runs/few --iterations 5000 --out runs/vr
@@ -26,8 +26,7 @@ out; work is counted in rays, tiles and pairs. The user study cannot be repeated
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.vr import render
-from minisplat_ref.extensions.vr.gradient_checks import stages
-from minisplat_ref.extensions.vr.method import HEADSET, VR, VR_FINE_TUNING
+from minisplat_ref.extensions.vr.model import HEADSET, VR, VR_FINE_TUNING, stages
 
 EXTENSION = Extension(
     "vr",

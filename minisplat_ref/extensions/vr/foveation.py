@@ -169,7 +169,7 @@ def render_foveated(
     image, zones = np.zeros((camera.height, camera.width, 3), model.gaussians.means.dtype), []
     for sampling, bins, weight, begin in zip(samplings, lists, weights, begins, strict=True):
         if sampling.is_needed.any():
-            coarse = _draw(prepared, sampling, bins)
+            coarse = _render_zone(prepared, sampling, bins)
             image += weight[:, :, None] * _interpolate(coarse, sampling.block, weight.shape)
         n_tiles, n_rays = int(sampling.is_needed.sum()), _n_pixels(sampling.is_needed, sampling.grid)
         zones.append(Zone(sampling.block, begin, n_tiles, n_rays, len(bins.gaussian_ids)))
@@ -223,7 +223,7 @@ def _in_blocks(boxes: Ints, sampling: Sampling) -> Ints:
     return np.minimum(touched, size).astype(np.int32)
 
 
-def _draw(prepared: Prepared, sampling: Sampling, bins: TileBins) -> Floats:
+def _render_zone(prepared: Prepared, sampling: Sampling, bins: TileBins) -> Floats:
     """Return the image [H, W, 3] of a zone; Gaussians that are not listed there are not even read."""
     rows = np.unique(bins.gaussian_ids)
     fields = {name: field[rows] for name, field in prepared.footprints._asdict().items() if name != "camera"}

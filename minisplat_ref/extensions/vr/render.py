@@ -32,7 +32,7 @@ def gaze(text: str) -> tuple[float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the test views, or all views where there are none, and print the work of each zone.
+    """Render the test views, or all views where there are none, and print the work of each zone.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         The PLY or the cameras cannot be used, the gaze lies outside an image, or the folder exists.
     """
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
-    from minisplat_ref.extensions.vr.method import BUFFER
+    from minisplat_ref.extensions.vr.model import BUFFER
     from minisplat_ref.interface.progress import with_progress
     from minisplat_ref.interface.reporting import markdown_table
     from minisplat_ref.io import load_ply, write_image
@@ -63,12 +63,12 @@ def run(args: argparse.Namespace) -> int:
     names = file_names([view.name for view in views])
     with making_folder(args.out) as folder:
         bar = with_progress(views, "rendering")
-        drawn = [render_foveated(model, view.camera, Request(), look, BUFFER) for view in bar]
-        for name, (image, _) in zip(names, drawn, strict=True):
+        rendered = [render_foveated(model, view.camera, Request(), look, BUFFER) for view in bar]
+        for name, (image, _) in zip(names, rendered, strict=True):
             write_image(folder / f"{name}.png", image)
     n_pixels = sum(view.camera.width * view.camera.height for view in views)
     rows = []
-    for zones in zip(*(zones for _, zones in drawn), strict=True):
+    for zones in zip(*(zones for _, zones in rendered), strict=True):
         n_samples = sum(zone.n_samples for zone in zones)
         tiles, pairs = (sum(getattr(zone, name) for zone in zones) for name in ("n_tiles", "n_pairs"))
         first, share = zones[0], f"{100 * n_samples / n_pixels:.1f} %"

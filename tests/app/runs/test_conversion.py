@@ -170,7 +170,7 @@ def test_what_convert_refuses(run, tmp_path, one_line):
 
 
 def test_further_fields_need_a_ply(run, tmp_path, one_line, capfd):
-    from minisplat_ref.extensions.velocity.method import at_rest
+    from minisplat_ref.extensions.velocity.model import at_rest
 
     moving = at_rest(load_ply(run / "point_cloud.ply"), np.random.default_rng(0))
     save_ply(tmp_path / "moving.ply", moving)

@@ -1,10 +1,9 @@
-"""The population with velocities, its renderer, and the recipe that trains it."""
+"""Gaussians with velocities: the population, the formula beside its gradient, the renderer, and the recipe."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Inputs, RenderGradient, Request, wrap
@@ -30,6 +29,47 @@ class MovingGaussians(NamedTuple):
 def at_rest(gaussians: Gaussians, rng: np.random.Generator) -> MovingGaussians:
     """Return the Gaussians with velocities of zero."""
     return MovingGaussians(**gaussians._asdict(), velocities=np.zeros_like(gaussians.means))
+
+
+def means_at(means: Floats, velocities: Floats, time: float) -> Floats:
+    """Return the centres at a time: ``mu(t) = mu + t nu``.
+
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        Centres mu at time 0, world frame.
+    velocities : ndarray of shape (N, 3)
+        nu, world units per unit of time.
+    time : float
+        t.
+
+    Returns
+    -------
+    ndarray of shape (N, 3)
+        In the dtype of the means.
+    """
+    return means + means.dtype.type(time) * velocities
+
+
+def means_at_vjp(time: float, v_means_at: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`means_at` with respect to means and velocities.
+
+    ::
+
+        v_mu = v_mu(t),   v_nu = t v_mu(t)
+
+    Parameters
+    ----------
+    time : float
+        t.
+    v_means_at : ndarray of shape (N, 3)
+        Derivative with respect to the centres at that time.
+
+    Returns
+    -------
+    v_means, v_velocities : ndarray of shape (N, 3)
+    """
+    return v_means_at, v_means_at.dtype.type(time) * v_means_at
 
 
 def still_at(moving: MovingGaussians, time: float) -> Gaussians:

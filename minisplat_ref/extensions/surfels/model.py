@@ -1,18 +1,26 @@
-"""The stages of the gradient check: the renderer with all its channels, rays, and normals from depths."""
+"""The recipe of 2D Gaussian Splatting, and what its gradient check covers.
+
+Population, renderer and losses are those of :mod:`minisplat_ref.mechanisms.surfels`.
+"""
 
 import numpy as np
 
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
-from minisplat_ref.mechanisms.surfels.discs import DISCS
+from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS, DISCS
 from minisplat_ref.mechanisms.surfels.gradient_checks import rays_stage, renderer_stage
+from minisplat_ref.mechanisms.surfels.losses import LOSSES
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering.backends import Backend
 
+RECIPE = GS_ACCEL._replace(name="surfels", losses=(*GS_ACCEL.losses, *LOSSES), events=DISC_EVENTS)
+"""``surfels``: the schedule and the density control of 3DGS with the paper's two losses."""
+
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return them; normals from depths are NumPy on every backend."""
+    """Return the renderer with all its channels, rays, and normals from depths, which are NumPy on every backend."""
     depth = rng.uniform(2, 3, size=(6, 7))
     normals = Stage(
         "central_normals",

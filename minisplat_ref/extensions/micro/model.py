@@ -1,10 +1,14 @@
-"""Micro-splatting's formulas in NumPy: the trace penalty with its gradient, and the detail of a photograph."""
+"""The formulas of Micro-splatting: the trace penalty beside its gradient, the detail of a photograph, and likeness."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import sobel
 
 from minisplat_ref.constants import LUMA
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.types import Bools, Floats, Ints
 
 SOBEL_SUM = 8.0  # a ramp of one unit per pixel gives this
@@ -123,3 +127,18 @@ def are_alike(distances: Floats, sizes: Floats, colors: Floats, *, reach: float,
     smaller, larger = sizes.min(axis=1), sizes.max(axis=1)
     differences = np.abs(colors[:, 0] - colors[:, 1]).max(axis=1)
     return (distances < reach * smaller) & (differences < color_reach) & (larger <= 2 * smaller)
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the penalty with a limit that half of the Gaussians exceed; all backends share it."""
+    log_scales = setting.gaussians.log_scales
+    ordered, middle = np.sort(traces(log_scales)), len(log_scales) // 2
+    limit = float(ordered[middle - 1 : middle + 1].mean())  # between traces: no kink there
+
+    def function(log_scales: Floats) -> Point:
+        return Point((np.asarray(trace_penalty(log_scales, limit)),), (traces(log_scales) > limit,))
+
+    def vjp(v_penalty: Floats) -> tuple[Floats, ...]:
+        return (trace_penalty_vjp(log_scales, limit, float(v_penalty)),)
+
+    return (Stage("trace_penalty", {"log_scales": log_scales}, ("penalty",), function, vjp),)

@@ -1,41 +1,55 @@
-"""The command ``minisplat-ref segment label``: a label for every Gaussian, or one object with or without the rest."""
+"""The commands ``segment label`` and ``segment render``: labels from masks, and what cameras see of them."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.segment.assignment import UNSEEN, belongs, labels
-from minisplat_ref.extensions.segment.maps import read_masks
-from minisplat_ref.extensions.segment.model import read_subject, save_labelled, save_part
-from minisplat_ref.extensions.segment.votes import Votes, count_votes
+from minisplat_ref.extensions.segment.files import read_labels, read_masks, read_subject, save_labelled, save_part
+from minisplat_ref.extensions.segment.votes import UNSEEN, Votes, assign_labels, belongs, count_votes, label_map
+from minisplat_ref.interface.palette import SERIES
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.interface.reporting import markdown_table
+from minisplat_ref.io import write_image
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.types import Ints
 
-DESCRIPTION = """\
+LABEL_DESCRIPTION = """\
 Give every Gaussian a label, from masks of some photographs: NAME.png for the
 photograph NAME, whose pixels are ids and 0 is the background. Each Gaussian
 takes the label in whose pixels it has the largest share; one that no mask's
 camera sees gets -1. --extract and --remove write one object alone, or
 everything else.
 """
-EPILOG = """\
+LABEL_EPILOG = """\
 examples:
   minisplat-ref segment label runs/fox --masks masks --out labelled.ply
   minisplat-ref segment label runs/fox --masks masks --extract 1 --out head.ply
   minisplat-ref segment label runs/fox --masks masks --remove 1 --bias -0.3 \\
     --out without.ply"""
 
+RENDER_EPILOG = """\
+example:
+  minisplat-ref segment render labelled.ply --cameras runs/fox/cameras.json \\
+    --out labels"""
+
 
 def add_parser(commands: Any) -> None:
-    """Add the command."""
+    """Add both commands."""
+    add_label(commands)
+    add_render(commands)
+
+
+def add_label(commands: Any) -> None:
+    """Add the command ``label``."""
     parser = commands.add_parser(
         "label",
         help="label Gaussians from masks, take an object out or away",
-        description=DESCRIPTION,
-        epilog=EPILOG,
+        description=LABEL_DESCRIPTION,
+        epilog=LABEL_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run, or a PLY with its cameras")
@@ -46,10 +60,10 @@ def add_parser(commands: Any) -> None:
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--extract", type=int, metavar="ID", help="write the Gaussians of one object alone")
     part.add_argument("--remove", type=int, metavar="ID", help="write all but those of one object")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=label_gaussians)
 
 
-def run(args: argparse.Namespace) -> int:
+def label_gaussians(args: argparse.Namespace) -> int:
     """Read masks, count votes, write.
 
     Raises
@@ -72,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     votes = count_votes(subject.placed, subject.renderer, ((view.camera, mask) for view, mask in bar), ids)
     n = len(subject.population.means)
     if wanted is None:
-        found = labels(votes, args.bias)
+        found = assign_labels(votes, args.bias)
         save_labelled(args.out, subject, found)
         print(f"{n:,} Gaussians with labels in {args.out}, from {len(masks)} masks\n\n{table(votes, found)}")
     else:
@@ -96,3 +110,52 @@ def table(votes: Votes, found: Any) -> str:
         rows.append([str(label), f"{np.count_nonzero(is_own):,}", share])
     rows.append([str(UNSEEN), f"{np.count_nonzero(found == UNSEEN):,}", ""])
     return markdown_table(["label", "Gaussians", "of their weight in its pixels"], rows)
+
+
+def add_render(commands: Any) -> None:
+    """Add the command ``render``."""
+    parser = commands.add_parser(
+        "render",
+        help="draw the labels that the cameras see",
+        epilog=RENDER_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", type=Path, metavar="PLY", help="with labels, from segment label")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for ids/ and colors/")
+    parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: beside the PLY)")
+    parser.set_defaults(run=render_labels)
+
+
+def render_labels(args: argparse.Namespace) -> int:
+    """Render every camera's labels.
+
+    Raises
+    ------
+    InputError
+        The model has no labels or there are no cameras.
+    """
+    subject = read_subject(args.model, args.cameras)
+    labels = read_labels(subject)
+    if labels.max(initial=0) > np.iinfo(np.uint16).max:
+        raise InputError(
+            f"{args.model}: a label of {labels.max()} does not fit into a PNG; number objects below 65,536"
+        )
+    with making_folder(args.out) as folder:
+        for view in with_progress(subject.cameras, "rendering", "views"):
+            ids = label_map(subject.placed, labels, subject.renderer, view.camera)
+            for kind, image in (
+                ("ids", ids.astype(np.uint8 if ids.max() < 256 else np.uint16)),
+                ("colors", paint(ids)),
+            ):
+                file = folder / kind / f"{view.name}.png"
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_image(file, image)
+    print(f"labels of {len(subject.cameras)} cameras in {args.out}: ids/ has numbers, colors/ is to look at")
+    return 0
+
+
+def paint(ids: Ints) -> NDArray[np.uint8]:
+    """Return an image [H, W, 3] of labels [H, W]: black is the background, colours repeat after eight labels."""
+    colors = [[0, 0, 0], *([int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in SERIES)]
+    rows = np.where(ids > 0, 1 + (ids - 1) % len(SERIES), 0)
+    return np.array(colors, np.uint8)[rows]

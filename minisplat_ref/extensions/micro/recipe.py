@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.micro.reference import (
+from minisplat_ref.extensions.micro.model import (
     are_alike,
     box_means,
     detail_map,

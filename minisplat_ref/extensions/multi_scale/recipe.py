@@ -1,4 +1,4 @@
-"""The renderer of levels, and the recipe that trains them."""
+"""The action that inserts coarser levels, the loss of smaller images, and the recipe."""
 
 from functools import partial
 from typing import Any
@@ -6,44 +6,19 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
-from minisplat_ref.io.frames import Unit
+from minisplat_ref.extensions.multi_scale.model import LEVELS, Plan, add_levels
 from minisplat_ref.mechanisms.sampling import block_means, sampling_intervals, zoom_camera
 from minisplat_ref.methods.gaussian_splatting import GS
-from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.strategy.ops import NO_PARENT, Edit, n_rows
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
-from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import At
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, View, view_from
+from minisplat_ref.types import Camera, Floats, Gaussians, view_from
 
 FACTOR, N_LEVELS = 4, 3  # levels for images of 1/4, 1/16 and 1/64 of the size, as in the paper
 COVERAGE_MIN = 4.0  # pixels, of the ellipse where alpha is at least 1/255; if opaque, a standard deviation of 0.6
 INSERTION = 15_000  # iteration at which densification has ended
 SIZE_MIN = 8  # pixels per side of the smallest image that is trained on
-
-
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw at each place the level that suits the camera; the tape is that of 3DGS."""
-    g = model.gaussians
-    is_shown = are_shown(g.cells, pixel_densities(g.means, view.camera, request.conventions.near_plane))
-    if not is_shown.all():
-        is_shown = is_shown if request.is_visible is None else is_shown & request.is_visible
-        request = request._replace(is_visible=is_shown)
-    return SPLATTING.render(model, view, request)
-
-
-LEVELS = Representation(
-    "Gaussians in levels",
-    population=MultiScaleGaussians,
-    units={**WORLD_UNITS, "cells": Unit.LENGTH},
-    extend=level_zero,
-    renderer=Renderer("multi-scale", render, SPLATTING.render_vjp, SPLATTING.channels),
-    rates=Rates({"cells": 0.0}, frozenset()),
-)
 
 
 def finest_densities(means: Floats, cameras: list[Camera]) -> Floats:
@@ -68,7 +43,7 @@ def insert_levels(
     if n == 0:
         return "nothing done: there are no Gaussians"
     densities = finest_densities(state.gaussians.means, [view.camera for view in iteration.scene.train_views])
-    gaussians: Any = with_levels(state.gaussians, densities, plan, iteration.render_settings.conventions)
+    gaussians: Any = add_levels(state.gaussians, densities, plan, iteration.render_settings.conventions)
     is_new = np.arange(n_rows(gaussians)) >= n
     apply_edit(state, Edit(gaussians, np.where(is_new, NO_PARENT, np.arange(len(is_new))), is_new))
     return None
@@ -93,10 +68,10 @@ def coarse(
     if mask is not None and not mask.any():
         return 0.0, Cotangents()
     small = view_from(zoom_camera(view.camera, 1 / n), time=view.time)
-    output, tape = render(model, small, request._replace(wants=frozenset()))
+    output, tape = LEVELS.renderer.render(model, small, request._replace(wants=frozenset()))
     target = block_means(view.image.astype(np.float32) / 255, n).astype(output.image.dtype)
     loss, loss_tape = request.backend.photometric_loss(output.image, target, dssim_weight, mask)
-    v = SPLATTING.render_vjp(tape, request.backend.photometric_loss_vjp(loss_tape), None)
+    v = LEVELS.renderer.render_vjp(tape, request.backend.photometric_loss_vjp(loss_tape), None)
     return loss, Cotangents(gaussians={name: getattr(v.gaussians, name) for name in Gaussians._fields})
 
 

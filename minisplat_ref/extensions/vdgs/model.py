@@ -1,10 +1,14 @@
-"""The network, the renderer that evaluates it for every view, and the recipe.
+"""VDGS: what a network of place and direction does to opacities and colours, the renderer, and the recipe.
 
 With the centre mu of a Gaussian, the direction d from which it is seen, and the hash grid E::
 
     y = MLP([d, E(p)]),   p = (contract((mu - c) / r) + 2) / 4
 
-c is the median of the scene's points, and nine tenths of them are within r. The last layer starts at 0, so y does.
+c is the median of the scene's points, and nine tenths of them are within r. The last layer starts at 0, so y does. The
+effect of y on opacities and coefficients is in NumPy alone: a few operations per Gaussian are negligible compared with
+the network and the hash grid, which have kernels.
+
+``--set modulation=NAME`` chooses one of the modes, which are functions.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,31 +17,144 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.vdgs.modes import Mode, opacity_times
-from minisplat_ref.extensions.vdgs.reference import (
-    Opacities,
-    modulate,
-    modulate_vjp,
-    modulated_logits,
-    modulated_logits_vjp,
-)
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.networks.contraction import contract, contract_vjp
 from minisplat_ref.mechanisms.networks.directions import directions, directions_vjp
 from minisplat_ref.mechanisms.networks.hash_grid import Levels, make_levels, make_table
 from minisplat_ref.mechanisms.networks.mlp import Layer, from_shared, make_network, network_rates, to_shared
-from minisplat_ref.mechanisms.networks.networks import Networks, networks_for
+from minisplat_ref.mechanisms.networks.networks import IN_NUMPY, Networks, networks_for
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
-from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
 
+OPACITY_MAX = 0.99  # for opacities that the network raises
+OPACITY_MIN = 1e-4  # below 1/255, which no pixel shows
 N_LEVELS, N_ROWS, N_FEATURES = 4, 2**12, 2  # of the hash grid
 COARSEST, FINEST = 16, 128  # cells along a side
 HIDDEN = 32
 N_COLORS = 48  # coefficients of degrees 0 to 3
 NAME, TABLE, CENTER, RADIUS = "network", "hash_table", "place_center", "place_radius"
+
+
+class Mode(NamedTuple):
+    """The use of the network's outputs."""
+
+    opacity: bool
+    """The first output changes the opacity."""
+    colors: bool
+    """The others change the coefficients of colour."""
+    is_sum: bool
+    """``x + y`` instead of ``x (1 + y)``."""
+
+
+def opacity_times() -> Mode:
+    """Multiply the opacity, which is the paper's choice."""
+    return Mode(True, False, is_sum=False)
+
+
+def opacity_plus() -> Mode:
+    """Add to the opacity."""
+    return Mode(True, False, is_sum=True)
+
+
+def colors_times() -> Mode:
+    """Multiply the coefficients of colour."""
+    return Mode(False, True, is_sum=False)
+
+
+def colors_plus() -> Mode:
+    """Add to the coefficients of colour."""
+    return Mode(False, True, is_sum=True)
+
+
+def both_times() -> Mode:
+    """Multiply both."""
+    return Mode(True, True, is_sum=False)
+
+
+def both_plus() -> Mode:
+    """Add to both."""
+    return Mode(True, True, is_sum=True)
+
+
+def modulate(x: Floats, y: Floats, is_sum: bool) -> Floats:
+    """Return ``x + y``, or ``x (1 + y)``; both leave x where y is 0."""
+    return x + y if is_sum else x * (1 + y)
+
+
+def modulate_vjp(x: Floats, y: Floats, is_sum: bool, v: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`modulate` with respect to x and y: (v, v), or ``((1 + y) v, x v)``."""
+    return (v, v) if is_sum else ((1 + y) * v, x * v)
+
+
+class Opacities(NamedTuple):
+    """Opacities of a view, and the values that their gradient needs."""
+
+    logits: Floats
+    """[N] l' = logit(o')."""
+    own: Floats
+    """[N] o, which all views share."""
+    seen: Floats
+    """[N] o'."""
+    is_free: Bools
+    """[N] where o' is at neither bound."""
+
+
+def modulated_logits(logits: Floats, y: Floats, is_sum: bool) -> Opacities:
+    """Return the logits l' of a view's opacities, from those of all views and the network's output.
+
+    ::
+
+        o = sigmoid(l),   o' = min(max(o (1 + y) or o + y, 1e-4), 0.99),   l' = log(o' / (1 - o'))
+
+    Where y is 0, and where it would raise an opacity above 0.99 further, l' is l to the last bit.
+
+    Parameters
+    ----------
+    logits, y : ndarray of shape (N,)
+    is_sum : bool
+        As for :func:`modulate`.
+    """
+    own = 1 / (1 + np.exp(-logits))
+    raw = modulate(own, y, is_sum)
+    seen = np.clip(raw, OPACITY_MIN, OPACITY_MAX)
+    is_kept = (y == 0) | ((own > OPACITY_MAX) & (raw > own))
+    found = np.where(is_kept, logits, np.log(seen) - np.log1p(-seen))
+    is_free = ((raw > OPACITY_MIN) & (raw < OPACITY_MAX)) | (y == 0)
+    return Opacities(found, own, np.where(is_kept, own, seen), is_free)
+
+
+def modulated_logits_vjp(opacities: Opacities, y: Floats, is_sum: bool, v: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`modulated_logits` with respect to l and y.
+
+    ::
+
+        v_o' = v / (o' (1 - o')) between the bounds, 0 at them
+        v_o, v_y = those of modulate,   v_l = o (1 - o) v_o
+
+    Where an opacity above 0.99 is kept, v_l = v and v_y = 0.
+
+    Parameters
+    ----------
+    opacities : Opacities
+        From the forward function.
+    y, is_sum
+        As there.
+    v : ndarray of shape (N,)
+        Derivative with respect to l'.
+    """
+    own, seen = opacities.own, opacities.seen
+    v_seen = np.zeros_like(v)
+    np.divide(v, seen * (1 - seen), out=v_seen, where=opacities.is_free)
+    v_own, v_y = modulate_vjp(own, y, is_sum, v_seen)
+    is_kept = ~opacities.is_free & (seen == own) & (own > OPACITY_MAX)
+    return np.where(is_kept, v, own * (1 - own) * v_own), v_y
 
 
 class Tape(NamedTuple):
@@ -63,7 +180,7 @@ def n_outputs(mode: Mode) -> int:
 
 def initial_shared(scene: Scene, rng: np.random.Generator, *, modulation: Callable[[], Mode]) -> Mapping[str, Floats]:
     """Return the network, whose last layer is 0, the hash grid, and the bounds of the scene, float32."""
-    (rng,) = rng.spawn(1)  # so that the training draws the random numbers of one of 3DGS
+    (rng,) = rng.spawn(1)  # so that the training gets the random numbers of one of 3DGS
     levels = make_levels(N_LEVELS, COARSEST, FINEST, n_rows=N_ROWS, n_features=N_FEATURES)
     network = make_network((3 + N_LEVELS * N_FEATURES, HIDDEN, n_outputs(modulation())), rng)
     last = Layer(*(np.zeros_like(array) for array in network[-1]))
@@ -151,7 +268,7 @@ def as_seen_vjp(tape: Tape, v: RenderGradient) -> RenderGradient:
     )
 
 
-def render(
+def render_modulated(
     model: Model, view: View, request: Request, *, modulation: Callable[[], Mode]
 ) -> tuple[RenderOutput, tuple[Any, Tape | None]]:
     """Render the Gaussians as the view's camera sees them; without a network, as in a file alone, those of 3DGS."""
@@ -163,8 +280,8 @@ def render(
     return output, (inner, tape)
 
 
-def render_vjp(tapes: tuple[Any, Tape | None], v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
-    """Gradient of :func:`render`: that of 3DGS, carried on to the network."""
+def render_modulated_vjp(tapes: tuple[Any, Tape | None], v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+    """Gradient of :func:`render_modulated`: that of 3DGS, carried on to the network."""
     inner, tape = tapes
     v = SPLATTING.render_vjp(inner, v_image, v_alpha)
     return v if tape is None else as_seen_vjp(tape, v)
@@ -173,7 +290,9 @@ def render_vjp(tapes: tuple[Any, Tape | None], v_image: Floats, v_alpha: Floats 
 VIEW_DEPENDENT = Representation(
     "vdgs",
     shared=partial(initial_shared, modulation=opacity_times),
-    renderer=Renderer("vdgs", partial(render, modulation=opacity_times), render_vjp, SPLATTING.channels),
+    renderer=Renderer(
+        "vdgs", partial(render_modulated, modulation=opacity_times), render_modulated_vjp, SPLATTING.channels
+    ),
     rates=Rates(
         {
             TABLE: LogLinear(1e-2, 1e-3, 30_000),
@@ -185,5 +304,48 @@ VIEW_DEPENDENT = Representation(
     ),
     units={**WORLD_UNITS, CENTER: Unit.PLACE, RADIUS: Unit.LENGTH},
 )
+
 VDGS = GS_ACCEL._replace(name="vdgs")
 """``vdgs``: 3DGS whose opacities, or colours, a network changes with the view."""
+
+SMALL_HIDDEN, SMALL_LEVELS, SMALL_ROWS = 3, 1, 8  # of one coarse level: between many faces, steps would round
+MODES = (opacity_times, colors_plus, both_times, both_plus)  # the other two are parts of those that change both
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return one stage for each mode, with a small network and table; the first replaces that of the whole renderer.
+
+    ReLUs, the faces of the grid's cells and the bounds of opacity are kinks, whose sides are part of a point.
+    """
+    return tuple(_stage(backend, setting, modulation, rng) for modulation in MODES)
+
+
+def small_shared(modulation: Callable[[], Mode], n_colors: int, rng: np.random.Generator) -> dict[str, Floats]:
+    """Return a network and a table of which every number can be checked."""
+    mode = modulation()
+    n = mode.opacity + n_colors * mode.colors
+    network = make_network((3 + SMALL_LEVELS, SMALL_HIDDEN, min(n, n_outputs(mode))), rng)
+    shared = {name: 0.3 * array for name, array in to_shared(NAME, network).items()}
+    table = rng.normal(size=(SMALL_LEVELS, SMALL_ROWS, 1))
+    return {**shared, TABLE: table, CENTER: np.zeros(3), RADIUS: np.array([2.0])}
+
+
+def _stage(backend: Backend, setting: Setting, modulation: Callable[[], Mode], rng: np.random.Generator) -> Stage:
+    shared = small_shared(modulation, 3 * (1 + setting.gaussians.sh_rest.shape[1]), rng)
+    is_first = modulation is MODES[0]
+    representation = VIEW_DEPENDENT._replace(
+        name=VIEW_DEPENDENT.name if is_first else f"{VIEW_DEPENDENT.name}, {modulation.__name__}",
+        shared=lambda scene, rng: shared,
+        renderer=VIEW_DEPENDENT.renderer._replace(render=partial(render_modulated, modulation=modulation)),
+    )
+    return model_stage(backend, setting, representation, rng, sides_of=lambda drawn: _sides(drawn.tape[1]))
+
+
+def _sides(tape: Tape) -> tuple[Any, ...]:
+    """Return the ReLUs that are on, the cells of the grid, and which opacities are at no bound."""
+    means, shared = tape.model.gaussians.means, tape.model.shared
+    places = (contract((means - shared[CENTER]) / shared[RADIUS]) + 2) / 4
+    cells = [np.floor(places * n) for n in levels_of(shared[TABLE]).resolutions]
+    bounds = () if tape.opacities is None else (tape.opacities.is_free,)
+    hidden = as_seen(tape.model, tape.camera, tape.mode, IN_NUMPY)[1].inputs[1]  # kernels keep them otherwise
+    return (hidden > 0, *cells, *bounds)
