@@ -47,7 +47,7 @@ from minisplat_ref.extensions.compression.msz import CONTAINER, decode, encode
 from minisplat_ref.extensions.micro.model import trace_penalty, trace_penalty_vjp, traces
 from minisplat_ref.extensions.multi_scale.model import LEVELS, Plan, add_levels, are_shown, level_zero, pixel_densities
 from minisplat_ref.extensions.multi_scale.recipe import COVERAGE_MIN, finest_densities
-from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
+from minisplat_ref.extensions.omg.recipe import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid

@@ -48,9 +48,8 @@ from minisplat_ref.extensions.fans.method import render as render_fans
 from minisplat_ref.extensions.fans.shapes import FanShape, convert_gaussians, mesh_of
 from minisplat_ref.extensions.mixed import response as hull_response
 from minisplat_ref.extensions.polygons.soup import make_soup
-from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
-from minisplat_ref.extensions.textured.population import with_textures
-from minisplat_ref.extensions.textured.reference import frames, meet
+from minisplat_ref.extensions.textured.model import add_textures, frames, meet
+from minisplat_ref.extensions.textured.recipe import TEXTURED_GAUSSIANS
 from minisplat_ref.mechanisms.meshes.fans import fit_spans, rims
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.spherical_harmonics import sh_basis
@@ -75,7 +74,7 @@ def drawn(gaussians, renderer=TEXTURED_GAUSSIANS.renderer):
 def painted(k):
     """Return the Gaussian with coefficients [K, 3] of its colour over the harmonics."""
     degree = round(np.sqrt(len(k))) - 1
-    whole = with_textures(one, degree)
+    whole = add_textures(one, degree)
     return whole._replace(sh_dc=(k[:1] * SH_C0 - 0.5) / SH_C0, color_textures=k[1:].T.reshape(1, -1))
 
 

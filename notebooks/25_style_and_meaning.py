@@ -30,8 +30,8 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.segment.commands import paint
 from minisplat_ref.extensions.segment.votes import assign_labels, belongs, count_view_votes, count_votes, label_map
-from minisplat_ref.extensions.style.reference import match_colors
-from minisplat_ref.extensions.style.styling import Plan, stylise
+from minisplat_ref.extensions.style.model import match_colors
+from minisplat_ref.extensions.style.recipe import Plan, stylise
 from minisplat_ref.mechanisms.features.filters import CLASSICAL, EVEN, gabor_filters
 from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.strategy.ops import take
@@ -158,7 +158,7 @@ _ = figure
 #
 # ## Play
 #
-# Paint with another swatch, or with an image of your own: `read_style` of `extensions/style/styling.py` reads one.
+# Paint with another swatch, or with an image of your own: `read_style` of `extensions/style/recipe.py` reads one.
 
 # %% tags=["rounding"]
 other = stylise(room, made.scene, swatches["stripes"], Plan(iterations=40))

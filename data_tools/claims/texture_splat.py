@@ -18,8 +18,7 @@ from data_tools.claims.kit.claim import OUT, declare, seeds
 from data_tools.claims.kit.figures import group, mean_and_deviation, show, with_deviation
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.extensions.texture_splat.baking import Maps, bake
-from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, with_textures
-from minisplat_ref.extensions.texture_splat.renderer import TEXTURED
+from minisplat_ref.extensions.texture_splat.model import TEXTURED, TexturedSurfels, with_textures
 from minisplat_ref.interface.palette import BLUE, GREEN, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT

@@ -20,10 +20,9 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit import claim
-from data_tools.claims.kit.figures import subplots
-from data_tools.claims.kit.tables import mean, spread, table
-from minisplat_ref.extensions.textured.reference import frames, meet
-from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
+from data_tools.claims.kit.figures import with_deviation
+from minisplat_ref.extensions.textured.model import frames, meet
+from minisplat_ref.extensions.textured.recipe import fine_tune, measure, prepare
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.reference.spherical_harmonics import sh_basis

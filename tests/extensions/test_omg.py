@@ -17,11 +17,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_format, find_recipe
 from minisplat_ref.extensions.omg import file as omg
 from minisplat_ref.extensions.omg import trained_file
-from minisplat_ref.extensions.omg.appearance import features_of, fit_decoder
-from minisplat_ref.extensions.omg.method import prune_indistinct
-from minisplat_ref.extensions.omg.pack import read_training
-from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
-from minisplat_ref.extensions.omg.svq import fit_codes, quantise
+from minisplat_ref.extensions.omg.codes import fit_codes, quantise
+from minisplat_ref.extensions.omg.file import compute_features, fit_decoder
+from minisplat_ref.extensions.omg.recipe import distinct_importance, local_distinctiveness, prune_indistinct
+from minisplat_ref.extensions.omg.trained_file import read_training
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import indoor
@@ -190,7 +190,7 @@ def test_harmonics_of_few_dimensions_are_recovered(rng):
     directions, mean = rng.normal(size=(3, 45)), rng.normal(size=45)
     harmonics = mean + rng.normal(size=(200, 3)) @ directions
     decoder = fit_decoder(harmonics, 3)
-    back = decoder.harmonics(features_of(harmonics, decoder))
+    back = decoder.harmonics(compute_features(harmonics, decoder))
     assert np.abs(back - harmonics).max() < 10 * HALF_FLOAT * np.abs(harmonics).max()
     basis = decoder.directions.astype(np.float64)
     assert_allclose(basis @ basis.T, np.eye(3), atol=10 * HALF_FLOAT)
@@ -200,7 +200,7 @@ def test_the_decoder_is_the_best_linear_one(rng):
     """Three directions of random rotations do no better, and the error is the variance that is left."""
     harmonics = rng.normal(size=(500, 8)) * [5, 4, 3, 1, 0.5, 0.4, 0.3, 0.2]
     decoder = fit_decoder(harmonics, 3)
-    error = np.sum((decoder.harmonics(features_of(harmonics, decoder)) - harmonics) ** 2)
+    error = np.sum((decoder.harmonics(compute_features(harmonics, decoder)) - harmonics) ** 2)
     left = np.linalg.svd(harmonics - harmonics.mean(axis=0), compute_uv=False)[3:]
     assert error == pytest.approx(np.sum(left**2), rel=0.01)
 
@@ -234,7 +234,7 @@ def test_each_row_is_the_nearest_that_the_codebooks_have():
     """With as many codes as rows, only the error of half floats is left, row by row."""
     gaussians = population(60, 1)
     back = omg.decode(omg.encode(gaussians, 0), "file")
-    order = omg.order_of(gaussians)
+    order = omg.find_order(gaussians)
     ours = Gaussians(*(field[order] for field in gaussians))
     for name in ("log_scales", "opacity_logits", "sh_dc", "sh_rest"):
         field, other = getattr(ours, name), getattr(back, name)

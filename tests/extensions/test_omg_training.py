@@ -9,8 +9,23 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.omg import trained_file
-from minisplat_ref.extensions.omg.decoding import encode_places, gather, gather_vjp, run_networks, split_codes
-from minisplat_ref.extensions.omg.method import (
+from minisplat_ref.extensions.omg.codes import QUAT_MIN
+from minisplat_ref.extensions.omg.model import (
+    COMPACT,
+    PLACE,
+    OmgGaussians,
+    decode,
+    decode_vjp,
+    encode_places,
+    gather,
+    gather_vjp,
+    measure_place,
+    run_networks,
+    split_codes,
+    with_features,
+    without_features,
+)
+from minisplat_ref.extensions.omg.recipe import (
     fit_last_layer,
     prune_indistinct,
     round_centres,
@@ -18,9 +33,6 @@ from minisplat_ref.extensions.omg.method import (
     start_networks,
     write_fields,
 )
-from minisplat_ref.extensions.omg.population import PLACE, OmgGaussians, place_of, with_features, without_features
-from minisplat_ref.extensions.omg.renderer import COMPACT, decode, decode_vjp
-from minisplat_ref.extensions.omg.svq import QUAT_MIN
 from minisplat_ref.mechanisms.networks.networks import COMPILED, IN_NUMPY
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, restart_from_means
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
@@ -80,9 +92,9 @@ def test_places_by_hand():
 def test_the_place_of_a_scene():
     points = np.array([[x, 1.0, 1] for x in range(-5, 6)])
     scene = Scene("a", (), (), points, np.zeros((11, 3), np.uint8), np.zeros(3), extent=4.0)
-    assert_allclose(place_of(scene), [0, 1, 1, 1 / 5], rtol=CLOSED_FORM)
-    assert_allclose(place_of(scene._replace(points=points[:0])), [0, 0, 0, 1 / 4])
-    assert_allclose(place_of(scene._replace(points=points[:1])), [-5, 1, 1, 1 / 4])
+    assert_allclose(measure_place(scene), [0, 1, 1, 1 / 5], rtol=CLOSED_FORM)
+    assert_allclose(measure_place(scene._replace(points=points[:0])), [0, 0, 0, 1 / 4])
+    assert_allclose(measure_place(scene._replace(points=points[:1])), [-5, 1, 1, 1 / 4])
 
 
 def test_codes_by_hand():

@@ -14,20 +14,25 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.style import method, run_files
-from minisplat_ref.extensions.style.gradient_checks import stages
-from minisplat_ref.extensions.style.reference import (
+from minisplat_ref.extensions.style import recipe
+from minisplat_ref.extensions.style.model import (
     FeatureWeights,
+    areas,
+    cut_stretch,
     feature_loss,
+    largest,
+    make_children,
     match_colors,
     mean_square,
     nearest_rows,
     nnfm,
+    split,
+    split_large,
+    stages,
     total_variation,
     unit_rows,
 )
-from minisplat_ref.extensions.style.splitting import areas, children_of, cut_stretch, largest, split, split_large
-from minisplat_ref.extensions.style.styling import read_style, recolor
+from minisplat_ref.extensions.style.recipe import read_style, recolor
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
 from minisplat_ref.oracle.gradients import jacobian_case
@@ -136,7 +141,7 @@ def test_areas_are_products_of_the_larger_two():
 def test_children_keep_mean_and_covariance_in_the_plane(n):
     """Of the parent's axes x (longest), z and y: variances along x and z stay, y is not touched."""
     g = one()
-    children = children_of(g, np.array([0]), n)
+    children = make_children(g, np.array([0]), n)
     R = rotation_matrices(g.quats)[0]
     places = (children.means - g.means) @ R  # in the parent's axes
     total = np.cov(places.T, bias=True) + np.diag(np.exp(2 * children.log_scales[0]))
@@ -180,28 +185,28 @@ def test_colours_split_where_the_length_of_their_gradient_is_largest(monkeypatch
     moments = np.array([[1.0, 1, 1], [2.9, 0, 0], [4.0, 0, 0]])
     state = SimpleNamespace(gaussians=g, adam=SimpleNamespace(second=SimpleNamespace(sh_dc=moments)))
     edits = []
-    monkeypatch.setattr(method, "apply_edit", lambda state, edit: edits.append(edit))
-    assert method.split_by_color_gradient(state, None, max_share=0.7, n_children=4) is None
+    monkeypatch.setattr(recipe, "apply_edit", lambda state, edit: edits.append(edit))
+    assert recipe.split_by_color_gradient(state, None, max_share=0.7, n_children=4) is None
     assert set(edits[0].parent_ids[edits[0].is_new]) == {0, 2}
     moments[:] = 0
-    assert "no colour" in method.split_by_color_gradient(state, None, max_share=0.7, n_children=4)
+    assert "no colour" in recipe.split_by_color_gradient(state, None, max_share=0.7, n_children=4)
 
 
 def test_rows_of_a_style_are_spread_evenly():
     rows = np.arange(5_000)
-    found = method.evenly(rows)
+    found = recipe.thin_evenly(rows)
     assert len(found) == 2_000 and found[0] == 0 and found[-1] == 4_997 and set(np.diff(found)) == {2, 3}
-    assert_array_equal(method.evenly(rows[:10]), rows[:10])
+    assert_array_equal(recipe.thin_evenly(rows[:10]), rows[:10])
 
 
 def test_the_content_is_that_of_the_photograph():
     """A rendering that is the photograph has no error of its content, and none where the style weighs nothing."""
     image = np.random.default_rng(0).integers(0, 256, (48, 48, 3)).astype(np.uint8)
-    style = method.style_of(CLASSICAL, image / 255)
+    style = recipe.read_features(CLASSICAL, image / 255)
     rendered = SimpleNamespace(channel=lambda name: image / 255, view=SimpleNamespace(image=image))
     for weight, is_some in ((0.0, False), (1.0, True)):
         weights = FeatureWeights(weight, 5.0)
-        value, _ = method.style_features(
+        value, _ = recipe.style_features(
             rendered, style=style._replace(maps=tuple(-m for m in style.maps)), weights=weights
         )
         assert (value > 1e-12) == is_some
@@ -209,17 +214,17 @@ def test_the_content_is_that_of_the_photograph():
 
 def test_published_rounds_and_shares():
     """Four rounds, a fifth of the stage apart, with thresholds that grow by 1.125; colours split four times, too."""
-    rounds = method.RESTRUCTURE.events
+    rounds = recipe.RESTRUCTURE.events
     assert [event.step for event in rounds] == [200, 400, 600, 800]
     assert [round(event.action.keywords["factor"], 4) for event in rounds] == [1, 1.125, 1.2656, 1.4238]
     assert rounds[0].action.keywords["max_ratio"] == 1.5 and rounds[0].action.keywords["max_share"] == 0.1
     image = np.random.default_rng(0).uniform(size=(48, 48, 3)).astype(np.float32)
-    recipe = method.painting(method.style_of(CLASSICAL, image), FeatureWeights(10.0, 0.05))
-    (every,) = recipe.events
+    painted = recipe.painting(recipe.read_features(CLASSICAL, image), FeatureWeights(10.0, 0.05))
+    (every,) = painted.events
     assert [step for step in range(1, 1001) if every.is_due(step)] == [200, 400, 600, 800]
     assert every.action.keywords == {"max_share": 0.05, "n_children": 4}
-    trained = {name for name, rate in recipe.learning_rates.of.items() if rate}
-    assert trained == {"sh_dc"} and recipe.losses[1].weight == 1e-4
+    trained = {name for name, rate in painted.learning_rates.of.items() if rate}
+    assert trained == {"sh_dc"} and painted.losses[1].weight == 1e-4
 
 
 # A run
@@ -293,7 +298,10 @@ def test_a_thin_style_keeps_a_pixel(tmp_path):
 
 
 def test_a_run_without_gaussians_is_refused(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run_files, "load_ply", lambda path: Gaussians(*(field[:0] for field in load_ply(path))))
+    monkeypatch.setattr(
+        "minisplat_ref.extensions.style.transfer.load_ply",
+        lambda path: Gaussians(*(field[:0] for field in load_ply(path))),
+    )
     words = ["style", "transfer", str(folder / "run"), str(folder / "stripes.png"), "--out", str(tmp_path / "no")]
     assert main(words) == 2
     assert "holds no Gaussians" in capsys.readouterr().err and not (tmp_path / "no").exists()

@@ -9,16 +9,21 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.texture_splat import EXTENSION, kernels, reference
+from minisplat_ref.extensions.texture_splat import EXTENSION, kernels, textures
 from minisplat_ref.extensions.texture_splat.baking import Maps, bake
-from minisplat_ref.extensions.texture_splat.population import CHANNELS, TexturedSurfels, texels_of, with_textures
-from minisplat_ref.extensions.texture_splat.reference import (
+from minisplat_ref.extensions.texture_splat.model import (
+    CHANNELS,
+    TEXTURED,
+    TexturedSurfels,
+    count_texels,
+    with_textures,
+)
+from minisplat_ref.extensions.texture_splat.textures import (
     find_corners,
     raw_normals,
     tangent_normals,
     tangent_normals_vjp,
 )
-from minisplat_ref.extensions.texture_splat.renderer import TEXTURED
 from minisplat_ref.io import load_ply, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
@@ -149,10 +154,10 @@ def test_kernels_and_reference_agree(size, opacity, rng):
     texels, v = rng.normal(size=(40, size * size, 8)), rng.normal(size=(18, 24, 8))
     inputs = listed(g, camera, CPU)
     surfels, bins, conventions = inputs
-    expected = reference.blend_texels(surfels, texels, bins, conventions)
+    expected = textures.blend_texels(surfels, texels, bins, conventions)
     found = kernels.blend_texels(surfels, texels, bins, conventions)
     assert_allclose(found, expected, atol=PARITY_FLOAT64)
-    v_expected = reference.blend_texels_vjp(surfels, texels, bins, conventions, expected, v)
+    v_expected = textures.blend_texels_vjp(surfels, texels, bins, conventions, expected, v)
     v_found = kernels.blend_texels_vjp(surfels, texels, bins, conventions, expected, v)
     assert v_expected.texels.any() and np.abs(expected).max() > 0.3
     for name, a, b in zip(v_found._fields, v_found, v_expected, strict=True):
@@ -324,7 +329,7 @@ def test_a_run_starts_from_reflective_surfels_and_keeps_their_centres(runs):
     before = load_ply(runs / "reflective" / "point_cloud.ply", ReflectiveSurfels)
     after = EXTENSION.load(runs / "textured" / "point_cloud.ply", TexturedSurfels)
     assert_array_equal(after.means, before.means)
-    assert texels_of(after) == 3 and np.ptp(after.albedo_logits.reshape(-1, 9, 3), axis=1).max() > 0
+    assert count_texels(after) == 3 and np.ptp(after.albedo_logits.reshape(-1, 9, 3), axis=1).max() > 0
     assert after.normal_textures.any()
     with np.load(runs / "textured" / "shared.npz") as shared:
         assert shared[STAGE] == WITH_OCCLUSION and np.ptp(shared[ENVIRONMENT]) > 0
@@ -335,10 +340,10 @@ def test_a_run_shows_its_maps_and_can_be_continued(runs, capsys):
     assert all(read_image(path).max() > 20 for path in (runs / "textured" / "views").glob("*_normal.png"))
     again = ["--recipe", "texture-splat", "--init", str(runs / "textured"), "--iterations", "1"]
     assert main(["train", str(runs / "scene"), *again, "--out", str(runs / "again")]) == 0
-    assert texels_of(EXTENSION.load(runs / "again" / "point_cloud.ply", TexturedSurfels)) == 2  # the recipe's
+    assert count_texels(EXTENSION.load(runs / "again" / "point_cloud.ply", TexturedSurfels)) == 2  # the recipe's
     resumed = ["train", "--resume", str(runs / "textured"), "--iterations", "7"]
     assert main(resumed) == 0
-    assert texels_of(EXTENSION.load(runs / "textured" / "point_cloud.ply", TexturedSurfels)) == 3
+    assert count_texels(EXTENSION.load(runs / "textured" / "point_cloud.ply", TexturedSurfels)) == 3
 
 
 def test_bad_input_gets_one_line(runs, capsys):

@@ -12,10 +12,19 @@ from minisplat_ref import load_ply
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
-from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
-from minisplat_ref.extensions.textured.reference import LIMB, frames, frames_vjp, meet, meet_vjp
-from minisplat_ref.extensions.textured.response import RESPONSE, TexturedFootprints, bounds
+from minisplat_ref.extensions.textured.model import (
+    LIMB,
+    RESPONSE,
+    TexturedFootprints,
+    TexturedGaussians,
+    add_textures,
+    bounds,
+    frames,
+    frames_vjp,
+    meet,
+    meet_vjp,
+)
+from minisplat_ref.extensions.textured.recipe import TEXTURED_GAUSSIANS
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
@@ -123,7 +132,7 @@ def test_opacity_is_the_sigmoid_of_logit_and_texture(rng):
 
 def test_textures_of_zeros_have_a_gradient(rng):
     """So training changes them; that they change no image is tested for all payloads."""
-    _, v = drawn(RENDERER, with_textures(make_gaussians(rng, 30), 3), view_from(make_camera(rng=rng)), REFERENCE)
+    _, v = drawn(RENDERER, add_textures(make_gaussians(rng, 30), 3), view_from(make_camera(rng=rng)), REFERENCE)
     assert np.abs(v.gaussians.color_textures).max() > 0 and np.abs(v.gaussians.opacity_textures).max() > 0
 
 
@@ -135,7 +144,7 @@ def test_where_a_texture_makes_a_colour_negative_it_is_black_and_has_no_gradient
     takes 0.78, which leaves nothing, and 2 adds as much.
     """
     C, o, camera = 0.4886025119029199, 0.9, turned_camera(cx=17.5, cy=12.5)
-    ball = with_textures(balls(in_front_of(camera, [0, 0, 3.0]), [0.2], [o], [[0.1, 0.1, 0.1]]), 3)
+    ball = add_textures(balls(in_front_of(camera, [0, 0, 3.0]), [0.2], [o], [[0.1, 0.1, 0.1]]), 3)
     ball.color_textures.reshape(1, 3, 15)[0, :2, 2] = [-2, 2]
     ball.opacity_textures[0, 14] = 1e-300  # else it has no texture, and is a plain Gaussian
     output, tape = RENDERER.render(Model(ball), view_from(camera), Request(backend=backend))

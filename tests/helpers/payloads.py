@@ -13,10 +13,9 @@ from minisplat_ref.extensions.mixed.gradient_checks import stages as mixed_stage
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import as_ellipses
 from minisplat_ref.extensions.mixed.projection import in_plane_vjp
-from minisplat_ref.extensions.textured.gradient_checks import stages as textured_stages
-from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
-from minisplat_ref.extensions.textured.population import with_textures
-from minisplat_ref.extensions.textured.reference import meet_vjp
+from minisplat_ref.extensions.textured.model import add_textures, meet_vjp
+from minisplat_ref.extensions.textured.recipe import TEXTURED_GAUSSIANS
+from minisplat_ref.extensions.textured.recipe import stages as textured_stages
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Gaussians, Model
@@ -56,7 +55,7 @@ def uncut(gaussians, n_numbers=0):
 
 
 def random_textures(rng, gaussians, degree=3):
-    plain = with_textures(gaussians, degree)
+    plain = add_textures(gaussians, degree)
     return plain._replace(
         color_textures=0.3 * rng.normal(size=plain.color_textures.shape),
         opacity_textures=0.5 * rng.normal(size=plain.opacity_textures.shape),
@@ -90,10 +89,10 @@ CASES = {
     "textured": Case(
         TEXTURED_GAUSSIANS,
         random_textures,
-        lambda gaussians: with_textures(gaussians, 0),
-        lambda gaussians: with_textures(gaussians, 3),
+        lambda gaussians: add_textures(gaussians, 0),
+        lambda gaussians: add_textures(gaussians, 3),
         textured_stages,
-        ("minisplat_ref.extensions.textured.response.meet_vjp", meet_vjp),
+        ("minisplat_ref.extensions.textured.model.meet_vjp", meet_vjp),
     ),
 }
 

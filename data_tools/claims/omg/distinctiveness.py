@@ -18,11 +18,9 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.detail import Quality, quality
-from data_tools.claims.kit.figures import plot_deviations, set_ticks, subplots, with_deviation
-from data_tools.claims.kit.tables import mean, spread, table
-from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
-from minisplat_ref.extensions.omg.method import POWER
-from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
+from data_tools.claims.kit.figures import plot_deviations, set_ticks, with_deviation
+from minisplat_ref.extensions.omg.file import OMG_FILE, find_order
+from minisplat_ref.extensions.omg.recipe import POWER, distinct_importance, local_distinctiveness
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.io.ply import load_ply
@@ -102,7 +100,7 @@ def _row(kept: str, choice: str, at_once: Quality, tuned: Gaussians, scene: Scen
 
 def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float]]:
     """Return the loss at each level, dB, when one field alone is taken from a file; by field."""
-    whole = take(gaussians, order_of(gaussians))
+    whole = take(gaussians, find_order(gaussians))
     before = quality(whole, scene).psnr
     losses: dict[str, list[float]] = {field: [] for field in Gaussians._fields}
     for level in range(len(OMG_FILE.levels)):

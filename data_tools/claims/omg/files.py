@@ -17,8 +17,8 @@ from data_tools.claims.kit.figures import subplots, with_deviation
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.extensions.extension import all_formats, find_recipe
 from minisplat_ref.extensions.omg import trained_file
-from minisplat_ref.extensions.omg.method import OMG
-from minisplat_ref.extensions.omg.pack import read_training
+from minisplat_ref.extensions.omg.recipe import OMG
+from minisplat_ref.extensions.omg.trained_file import read_training
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import evaluate

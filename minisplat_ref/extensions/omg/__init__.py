@@ -3,17 +3,15 @@
 This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps the Gaussians that are
 important to the photographs, but of two important Gaussians side by side that look the same, one would suffice. So the
 pruning score is multiplied by the difference of a Gaussian's colour from its neighbours' in Morton order
-(:mod:`minisplat_ref.extensions.omg.reference`),
+(:mod:`.recipe`),
 
     S_i = I_i LD_i^lambda,   LD_i = mean_channels |c_i - c_prev| + |c_i - c_next|,   lambda = 2
 
-and the Gaussians of the largest scores that together carry tau = 99 % of the sum stay
-(:mod:`minisplat_ref.extensions.omg.method`). From iteration 15,000 on a Gaussian has six features instead of opacity
-and 48 coefficients of colour; small networks compute these from the features and from the place
-(:mod:`minisplat_ref.extensions.omg.decoding`). From 29,000 on scales, rotations and features are split into parts of
-one or two numbers, each part is an index into a separate codebook (:mod:`minisplat_ref.extensions.omg.svq`), and the
-codebooks are trained. ``.omg`` is the file: of a training (:mod:`minisplat_ref.extensions.omg.trained_file`), or fitted
-to any Gaussians (:mod:`minisplat_ref.extensions.omg.file`).
+and the Gaussians of the largest scores that together carry tau = 99 % of the sum stay (:mod:`.recipe`). From iteration
+15,000 on a Gaussian has six features instead of opacity and 48 coefficients of colour; small networks compute these
+from the features and from the place (:mod:`.model`). From 29,000 on scales, rotations and features are split into parts
+of one or two numbers, each part is an index into a separate codebook (:mod:`.codes`), and the codebooks are trained.
+``.omg`` is the file: of a training (:mod:`.trained_file`), or fitted to any Gaussians (:mod:`.file`).
 
     minisplat-ref train SCENE --recipe omg --out runs/small
     minisplat-ref omg pack runs/small/checkpoint.npz --out small.omg
@@ -33,12 +31,10 @@ same only if the rows are sorted already; here it is the inverse.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.omg import pack
+from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.file import OMG_FILE
-from minisplat_ref.extensions.omg.gradient_checks import stages
-from minisplat_ref.extensions.omg.method import OMG
-from minisplat_ref.extensions.omg.population import load_plain, save_plain, with_features
-from minisplat_ref.extensions.omg.renderer import COMPACT
+from minisplat_ref.extensions.omg.model import COMPACT, load_plain, save_plain, stages, with_features
+from minisplat_ref.extensions.omg.recipe import OMG
 
 EXTENSION = Extension(
     "omg",
@@ -49,7 +45,7 @@ EXTENSION = Extension(
     saves_plain=True,
     stages=stages,
     sample=with_features,
-    commands=(pack,),
+    commands=(trained_file,),
     formats=(OMG_FILE,),
 )
 """The recipe ``omg`` with its renderer, the format ``.omg``, and a command."""

@@ -8,6 +8,14 @@ opacity          1 number per part   its logit; in the paper a network computes 
 appearance       2 numbers per part  degree 0 (3 numbers) and the features of the higher harmonics
 ===============  ==================  =======================================================================
 
+The higher harmonics of a scene, [N, 45], are features and a shared decoder. With the mean m of all rows and orthonormal
+rows b_k, the principal directions,
+
+    h_i = m + sum_k f_ik b_k,   f_ik = b_k . (h_i - m)
+
+is the linear decoder with the least squared error for its number of features (principal component analysis). It
+replaces the paper's small networks, which read a position and three features and are trained with the scene.
+
 Codebooks and decoder are half floats. Indices and centres are planes of bytes that zstandard packs, where the paper
 uses Huffman coding, a point-cloud coder and xz. The error has no bound other than the codebooks; ``describe`` reports
 the number of codes. Decoding gives the same Gaussians on every machine except for the last bit of the higher harmonics,
@@ -23,22 +31,27 @@ import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.omg import parts, trained_file
-from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
-from minisplat_ref.extensions.omg.centers import FARTHEST, from_differences, to_differences, to_halves
-from minisplat_ref.extensions.omg.svq import QUAT_MIN, Quantised, quantise, unit_quats
+from minisplat_ref.extensions.omg import trained_file
+from minisplat_ref.extensions.omg.codes import (
+    FARTHEST,
+    GAUSSIANS_MAX,
+    QUAT_MIN,
+    Quantised,
+    are_codes,
+    are_planes,
+    decode_differences,
+    encode_differences,
+    is_center,
+    quantise,
+    read_codes,
+    read_integers,
+    refuse_header,
+    round_to_halves,
+    unit_quats,
+)
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label
-from minisplat_ref.io.packing.container import (
-    Container,
-    Packed,
-    is_count,
-    pack,
-    parse,
-    read_label,
-    unpack,
-    write_label,
-)
+from minisplat_ref.io.packing.container import Container, Packed, is_count, pack, parse, read_label, unpack, write_label
 from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.io.packing.planes import to_planes
 from minisplat_ref.types import Floats, Gaussians, Ints
@@ -46,6 +59,44 @@ from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"OMG\n", version=1)
 CODES_MAX = 2**16
+
+
+class Decoder(NamedTuple):
+    """A linear map from features to harmonics, in float16 as it is stored."""
+
+    mean: Floats
+    """[D] m."""
+    directions: Floats
+    """[F, D] b_k."""
+
+    def harmonics(self, features: Floats) -> Floats:
+        """Return ``h = m + f b`` [N, D] of features [N, F], float32."""
+        directions = self.directions.astype(np.float32)
+        return (self.mean.astype(np.float32) + features.astype(np.float32) @ directions).astype(np.float32)
+
+
+def fit_decoder(harmonics: Floats, n_features: int) -> Decoder:
+    """Return the linear decoder of harmonics [N, D] with the least squared error.
+
+    Parameters
+    ----------
+    harmonics : ndarray of shape (N, D)
+        h.
+    n_features : int
+        F; it is reduced to D or N where these are smaller.
+    """
+    n, d = harmonics.shape
+    rows = harmonics.astype(np.float64)
+    mean = rows.mean(axis=0) if n else np.zeros(d)
+    values, vectors = np.linalg.eigh((rows - mean).T @ (rows - mean))  # ascending
+    strongest = np.argsort(-values, kind="stable")[: min(n_features, d)]
+    return Decoder(mean.astype(np.float16), vectors[:, strongest].T.astype(np.float16))
+
+
+def compute_features(harmonics: Floats, decoder: Decoder) -> Floats:
+    """Return the features ``f_ik = b_k . (h_i - m)`` [N, F] of harmonics [N, D], float64."""
+    mean, directions = decoder.mean.astype(np.float64), decoder.directions.astype(np.float64)
+    return (harmonics.astype(np.float64) - mean) @ directions.T
 
 
 class Sizes(NamedTuple):
@@ -93,13 +144,13 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         raise InputError(
             f"means are {np.abs(center).max():.3g} from the origin: move the scene, or choose another format"
         )
-    offsets = to_halves(gaussians.means - center, "means")
+    offsets = round_to_halves(gaussians.means - center, "means")
     order = morton_order(offsets)
     rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
     harmonics = rows.sh_rest.reshape(n, 3 * n_rest)
-    to_halves(harmonics, "sh_rest")
+    round_to_halves(harmonics, "sh_rest")
     decoder = fit_decoder(harmonics, sizes.n_features)
-    features = features_of(harmonics, decoder)
+    features = compute_features(harmonics, decoder)
     vectors = {
         "scales": rows.log_scales,
         "rotations": unit_quats(rows.quats),
@@ -107,7 +158,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         "appearance": np.concatenate([rows.sh_dc, features, np.zeros((n, (3 + features.shape[1]) % 2))], axis=1),
     }
     quantised = {
-        name: quantise(to_halves(values, name).astype(np.float64), WIDTHS[name], getattr(sizes, name))
+        name: quantise(round_to_halves(values, name).astype(np.float64), WIDTHS[name], getattr(sizes, name))
         for name, values in vectors.items()
     }
     is_zero = (quantised["rotations"].codes[0] == 0).all(axis=1)
@@ -136,15 +187,15 @@ def _center(gaussians: Gaussians) -> Floats:
     return median.astype(np.float32)
 
 
-def order_of(gaussians: Gaussians) -> Ints:
+def find_order(gaussians: Gaussians) -> Ints:
     """Return the rows [N] of the Gaussians in the order of a file."""
-    return morton_order(to_halves(gaussians.means - _center(gaussians), "means"))
+    return morton_order(round_to_halves(gaussians.means - _center(gaussians), "means"))
 
 
 def _integers(offsets: Floats, quantised: Mapping[str, Quantised]) -> dict[str, Any]:
     """Return the integers that are packed as planes of bytes: differences of the centres, and indices."""
     indices = {name: of_parts.indices.astype(np.uint64) for name, of_parts in quantised.items()}
-    return {"means": to_differences(offsets), **indices}
+    return {"means": encode_differences(offsets), **indices}
 
 
 def decode(content: bytes, source: str | Path) -> Gaussians:
@@ -165,8 +216,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     packed = parse(CONTAINER, content, source)
     header = _check_header(packed)
     n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
-    offsets = from_differences(parts.read_integers(packed, header, "means", 3))
-    vectors = {name: parts.read_codes(packed, header, name, width).vectors() for name, width in WIDTHS.items()}
+    offsets = decode_differences(read_integers(packed, header, "means", 3))
+    vectors = {name: read_codes(packed, header, name, width).vectors() for name, width in WIDTHS.items()}
     raw = unpack(packed, "decoder", 2 * (1 + header.n_features) * 3 * n_rest)
     table = np.frombuffer(raw, "<f2").reshape(1 + header.n_features, 3 * n_rest)
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
@@ -202,19 +253,19 @@ def _check_header(packed: Packed) -> _Header:
     values = {name: packed.header.get(name) for name in _Header._fields}
     n, degree, level, center, n_features, codes, planes = values.values()
     is_right = (
-        is_count(n, parts.GAUSSIANS_MAX)
+        is_count(n, GAUSSIANS_MAX)
         and is_count(degree, SH_DEGREE_MAX)
         and is_count(level)
-        and parts.is_center(center)
+        and is_center(center)
         and is_count(n_features, 3 * ((SH_DEGREE_MAX + 1) ** 2 - 1))
-        and parts.are_planes(planes, WIDTHS)
+        and are_planes(planes, WIDTHS)
     )
     if is_right:
         assert isinstance(n_features, int)
         n_parts = {"scales": 3, "rotations": 2, "opacities": 1, "appearance": -(-(3 + n_features) // 2)}
-        is_right = parts.are_codes(codes, {name: (n_parts[name], CODES_MAX) for name in WIDTHS})
+        is_right = are_codes(codes, {name: (n_parts[name], CODES_MAX) for name in WIDTHS})
     if not is_right:
-        raise parts.no_gaussians(packed)
+        raise refuse_header(packed)
     return _Header(**values)  # type: ignore[arg-type]
 
 
@@ -233,26 +284,26 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
     return [*rows, ("features", f"{header.n_features} for the higher harmonics")]
 
 
-def _of_training(content: bytes) -> bool:
+def _is_trained(content: bytes) -> bool:
     """Return whether a file holds codes and networks as they were trained."""
     return content[:4] == trained_file.CONTAINER.magic
 
 
 def _decode(content: bytes, source: str | Path) -> Gaussians:
     """Read either kind of file."""
-    return trained_file.decode(content, source) if _of_training(content) else decode(content, source)
+    return trained_file.decode(content, source) if _is_trained(content) else decode(content, source)
 
 
 def _describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    return trained_file.describe(content, source) if _of_training(content) else describe(content, source)
+    return trained_file.describe(content, source) if _is_trained(content) else describe(content, source)
 
 
 def _write_label(content: bytes, label: Label) -> bytes:
-    return write_label(trained_file.CONTAINER if _of_training(content) else CONTAINER, content, label)
+    return write_label(trained_file.CONTAINER if _is_trained(content) else CONTAINER, content, label)
 
 
 def _read_label(content: bytes, source: str | Path) -> Label:
-    return read_label(trained_file.CONTAINER if _of_training(content) else CONTAINER, content, source)
+    return read_label(trained_file.CONTAINER if _is_trained(content) else CONTAINER, content, source)
 
 
 OMG_FILE = Format(

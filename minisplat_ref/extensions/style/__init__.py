@@ -3,12 +3,12 @@
 This follows G-Style, Kovacs et al. 2024, arXiv 2408.15695. A scene whose walls are a few large Gaussians cannot show
 stripes, so its Gaussians are split first, and then painted.
 
-1. *Colours* (:func:`~minisplat_ref.extensions.style.reference.match_colors`). Photographs and Gaussians get mean and
-   covariance of the style's colours: ``x' = M (x - mu_c) + mu_s`` with ``M = C_s^(1/2) C_c^(-1/2)``.
-2. *Splitting by area and cutting* (:mod:`~minisplat_ref.extensions.style.splitting`). While the photographs in the new
-   colours are learned, there are four rounds. Gaussians whose area, the product of their two largest scales, is above
-   ``mean + k std`` become four, and none stays longer than 1.5 times its second axis.
-3. *Painting* (:mod:`~minisplat_ref.extensions.style.method`). Base colours alone are trained, by
+1. *Colours* (:func:`.model.match_colors`). Photographs and Gaussians get mean and covariance of the style's colours:
+   ``x' = M (x - mu_c) + mu_s`` with ``M = C_s^(1/2) C_c^(-1/2)``.
+2. *Splitting by area and cutting* (:mod:`.model`). While the photographs in the new colours are learned, there are four
+   rounds. Gaussians whose area, the product of their two largest scales, is above ``mean + k std`` become four, and
+   none stays longer than 1.5 times its second axis.
+3. *Painting* (:mod:`.recipe`). Base colours alone are trained, by
 
        L = w_n NNFM + w_c mean (F - F_photograph)^2 + w_t TV,   NNFM = mean_p (1 - cos(F_p, nearest style feature))
 
@@ -33,6 +33,6 @@ weights are not ours to ship.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.style import transfer
-from minisplat_ref.extensions.style.gradient_checks import stages
+from minisplat_ref.extensions.style.model import stages
 
 EXTENSION = Extension("style", commands=(transfer,), stages=stages)

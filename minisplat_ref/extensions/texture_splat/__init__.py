@@ -7,7 +7,7 @@ Here it has T x T texels over four standard deviations to each side of its disc,
     X(u, v) = sum_ji h(y - j) h(x - i) X_ji,   x = (u / 4 + 1) (T - 1) / 2,   h(t) = max(0, 1 - |t|)
 
 X is a normal, from two numbers whose tanh is its tilt along the axes of the disc, with albedo, metallic share and
-roughness (:mod:`.reference`). The texels that hits read are blended, and each pixel is shaded once, as in Ref-Gaussian.
+roughness (:mod:`.textures`). The texels that hits read are blended, and each pixel is shaded once, as in Ref-Gaussian.
 With T = 1 this is Ref-Gaussian. Textures start as the constant values of each surfel of a finished run; then centres
 and their number stay, and everything else is trained. With maps of normals and materials as targets, texels are also
 the solution of a linear least-squares problem (:mod:`.baking`).
@@ -26,9 +26,7 @@ Learning rates are ours, and shapes and opacities are trained at those of 3DGS. 
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.texture_splat.file import load
-from minisplat_ref.extensions.texture_splat.gradient_checks import stages
-from minisplat_ref.extensions.texture_splat.method import RECIPE, TEXTURED_SURFELS
+from minisplat_ref.extensions.texture_splat.model import RECIPE, TEXTURED_SURFELS, load, stages
 
 EXTENSION = Extension(
     "texture-splat",

@@ -19,10 +19,8 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.texture_splat import kernels, reference
-from minisplat_ref.extensions.texture_splat.population import TexturedSurfels, texels_of
-from minisplat_ref.extensions.texture_splat.reference import raw_normals, tangent_normals
-from minisplat_ref.extensions.texture_splat.renderer import disc_axes
+from minisplat_ref.extensions.texture_splat.model import TexturedSurfels, choose_twin, count_texels, disc_axes
+from minisplat_ref.extensions.texture_splat.textures import raw_normals, tangent_normals
 from minisplat_ref.mechanisms.gbuffer.population import sigmoid
 from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.projection import Surfels
@@ -53,7 +51,7 @@ class _Sight(NamedTuple):
     surfels: Surfels
     bins: TileBins
     conventions: Conventions
-    module: Any  # kernels or reference
+    module: Any  # kernels or textures
     signs: Floats  # [N, 1, 1] of normals: whether that of the disc, or its opposite, is towards the camera
     is_known: Bools  # [H, W, 1]
 
@@ -122,7 +120,7 @@ def bake(
         moved = _nearest(ahead - steps_of * (_normal_product(sights, ahead) - wanted), axes)
         before, momentum = momentum, (1 + np.sqrt(1 + 4 * momentum**2)) / 2
         best, ahead = moved, moved + (before - 1) / momentum * (moved - best)
-    return _with_texels(population, best, is_read[:, :, 0])
+    return _store_texels(population, best, is_read[:, :, 0])
 
 
 def _nearest(texels: Floats, axes: Floats) -> Floats:
@@ -162,15 +160,19 @@ def _look(population: TexturedSurfels, maps: Maps, backend: Backend) -> _Sight:
     bins = discs.list_tiles(seen.surfels, camera, request.conventions, backend)
     _, signs = disc_axes(seen)
     dtype = population.means.dtype
-    module = kernels if backend.is_compiled else reference
     return _Sight(
-        seen.surfels, bins, request.conventions, module, signs[:, :, None].astype(dtype), maps.is_known[:, :, None]
+        seen.surfels,
+        bins,
+        request.conventions,
+        choose_twin(backend),
+        signs[:, :, None].astype(dtype),
+        maps.is_known[:, :, None],
     )
 
 
 def _world_texels(population: TexturedSurfels) -> Floats:
     """Return the texels [N, T^2, 8] that the population has, normals in the world."""
-    n, size = len(population.means), texels_of(population)
+    n, size = len(population.means), count_texels(population)
     axes = rotation_matrices(population.quats)
     tangent = tangent_normals(population.normal_textures.reshape(n, size * size, 2))
     normals = tangent @ np.swapaxes(axes, 1, 2)
@@ -179,7 +181,7 @@ def _world_texels(population: TexturedSurfels) -> Floats:
     return np.ascontiguousarray(np.concatenate([normals, albedo, shares], axis=2), population.means.dtype)
 
 
-def _with_texels(population: TexturedSurfels, texels: Floats, is_read: Bools) -> TexturedSurfels:
+def _store_texels(population: TexturedSurfels, texels: Floats, is_read: Bools) -> TexturedSurfels:
     """Return the population with texels as :func:`_world_texels` has them, where ``is_read`` [N, T^2]."""
     raw = raw_normals(texels[:, :, :3] @ rotation_matrices(population.quats))
     logits = np.log(texels[:, :, 3:]) - np.log1p(-texels[:, :, 3:])

@@ -27,8 +27,8 @@ from minisplat_ref.cpu.compositing.pixel_rows import (
     row_pixels,
 )
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.cpu.compositing.tile_state import pack_frame
-from minisplat_ref.extensions.texture_splat.reference import N_CHANNELS, REACH, TexelGradient
+from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.extensions.texture_splat.textures import N_CHANNELS, REACH, TexelGradient
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, accumulate, gather, load, reduce_any, reduce_sum, select, store
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -217,7 +217,7 @@ def backward_kernel(response: KernelResponse) -> Callable:
 
 
 def blend_texels(surfels: Surfels, texels: Floats, bins: TileBins, conventions: Conventions) -> Floats:
-    """Return sums over the hits, [H, W, 8]; see :func:`minisplat_ref.extensions.texture_splat.reference.blend_texels`.
+    """Return sums over the hits, [H, W, 8]; see :func:`minisplat_ref.extensions.texture_splat.textures.blend_texels`.
 
     In the dtype of the texels.
     """

@@ -1,9 +1,8 @@
 """Textured: colour and opacity that vary over each Gaussian, as spherical harmonics.
 
 This follows Textured-GS, Huang & Gong 2024, arXiv 2407.09733. In 3DGS a Gaussian has one colour for each viewing
-direction. Here a ray hits a point n on the Gaussian's ellipsoid of one standard deviation
-(:mod:`minisplat_ref.extensions.textured.reference`), and opacity and colour are spherical harmonics of n
-(:mod:`minisplat_ref.extensions.textured.response`):
+direction. Here a ray hits a point n on the Gaussian's ellipsoid of one standard deviation (:mod:`.model`), and opacity
+and colour are spherical harmonics of n:
 
     opacity(n) = sigmoid(l + sum_k h_k Y_k(n)),   color(n) = max(0, c + sum_k k_k Y_k(n)),   k = 1 ... 15
 
@@ -30,8 +29,7 @@ trains textures and shapes together from the first iteration on, which the paper
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.textured import fine_tune
-from minisplat_ref.extensions.textured.gradient_checks import stages
-from minisplat_ref.extensions.textured.method import TEXTURED, TEXTURED_GAUSSIANS
+from minisplat_ref.extensions.textured.recipe import TEXTURED, TEXTURED_GAUSSIANS, stages
 
 EXTENSION = Extension(
     "textured",

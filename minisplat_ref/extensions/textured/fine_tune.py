@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.textured.population import DEGREE
+from minisplat_ref.extensions.textured.model import DEGREE
 from minisplat_ref.interface.arguments import add_number
 from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.label import Label
@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
         The scene, the PLY or the output cannot be used, or a number is out of range.
     """
     from minisplat_ref.datasets.named_scenes import read_scene
-    from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
-    from minisplat_ref.training.representation import count_floats
+    from minisplat_ref.extensions.textured.recipe import fine_tune, measure, prepare
+    from minisplat_ref.training.representation import floats_of
 
     if not 1 <= args.degree <= DEGREE:
         raise InputError(f"--degree is {args.degree}: give 1, 2 or 3")

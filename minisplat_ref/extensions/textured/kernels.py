@@ -33,8 +33,7 @@ from minisplat_ref.extensions.textured.formulas import (
     times_5,
     times_7,
 )
-from minisplat_ref.extensions.textured.reference import LIMB
-from minisplat_ref.extensions.textured.response import TexturedFootprints, bounds
+from minisplat_ref.extensions.textured.model import LIMB, TexturedFootprints, bounds
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
@@ -150,7 +149,7 @@ def make_textured_response(exp: Callable, constants: tuple) -> KernelResponse:
     )
 
 
-def response_for(dtype: np.dtype) -> KernelResponse:
+def make_response(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     constants = (SH_C0, SH_C1, *SH_C2, *SH_C3, LIMB**2)
     as_data = np.dtype(dtype).type
@@ -180,8 +179,8 @@ def _records(conic_records: Callable, footprints: TexturedFootprints, dtype: np.
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
     records[:, LOGIT] = footprints.logits
     records[:, H : H + N_TEXTURE] = pad_textures(footprints.opacity_textures, 1)[:, 0]
-    records[:, A : A + 3], records[:, D_X : D_X + 6] = a / length, _by_columns(D)
-    records[:, C_X : C_X + 6] = _by_columns(C)
+    records[:, A : A + 3], records[:, D_X : D_X + 6] = a / length, _flatten_columns(D)
+    records[:, C_X : C_X + 6] = _flatten_columns(C)
     records[:, DEPTH], records[:, ODDS] = footprints.projection.depths, np.minimum(footprints.odds, ODDS_MAX)
     records[:, BOUND] = bounds(footprints.opacity_textures)
     return records
@@ -200,7 +199,7 @@ def _records_vjp(conic_records_vjp: Callable, footprints: TexturedFootprints, v_
     n_texture, dtype = footprints.opacity_textures.shape[1], footprints.means2d.dtype
     a, length, D, _ = _units(footprints)
     unit, xy = a / length, footprints.frames[:, :, :2].astype(np.float64)
-    v_D, v_C = _to_columns(v_records[:, D_X : D_X + 6]), _to_columns(v_records[:, C_X : C_X + 6])
+    v_D, v_C = _split_columns(v_records[:, D_X : D_X + 6]), _split_columns(v_records[:, C_X : C_X + 6])
     v_unit = v_records[:, A : A + 3] + np.cross(xy, v_C, axis=1).sum(axis=2)
     v_a = v_unit - unit * np.sum(unit * v_unit, axis=1, keepdims=True)
     v_a = (v_a - unit * np.einsum("nij,nij->n", D, v_D)[:, None]) / length
@@ -219,11 +218,11 @@ def _records_vjp(conic_records_vjp: Callable, footprints: TexturedFootprints, v_
     )
 
 
-def _by_columns(matrices: Floats) -> Floats:
+def _flatten_columns(matrices: Floats) -> Floats:
     """Return [N, 3, 2] as [N, 6], the first column first."""
     return np.swapaxes(matrices, 1, 2).reshape(-1, 6)
 
 
-def _to_columns(rows: Floats) -> Floats:
-    """Return [N, 6] as [N, 3, 2]: the inverse of :func:`_by_columns`."""
+def _split_columns(rows: Floats) -> Floats:
+    """Return [N, 6] as [N, 3, 2]: the inverse of :func:`_flatten_columns`."""
     return np.swapaxes(rows.reshape(-1, 2, 3), 1, 2)

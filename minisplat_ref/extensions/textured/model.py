@@ -1,6 +1,6 @@
-"""The point of a Gaussian's ellipsoid that the ray of a pixel hits, and its gradient, in NumPy (2407.09733).
+"""Gaussians with textures: the population, the point that a ray hits, and opacity and colour there, in NumPy.
 
-In the Gaussian's own axes, each in units of its standard deviation, the ellipsoid of one standard deviation is the unit
+In a Gaussian's own axes, each in units of its standard deviation, the ellipsoid of one standard deviation is the unit
 sphere around the origin, and a ray from the camera is a line. With K the camera's matrix, R_c and R the rotations of
 camera and Gaussian, s its standard deviations, z and p depth and pixel of its centre::
 
@@ -15,18 +15,70 @@ outside it. There n points to q, so that it does not jump at the limb. Near the 
 unbounded, so the root is kept from falling below ``LIMB``::
 
     g = sqrt(max(1 - q . q, LIMB^2)),  n = (q - g b / |b|) / sqrt(max(1, q . q + LIMB^2))
+
+With the real spherical harmonics Y_k, the opacity o = sigmoid(l) of 3DGS and its colour c, which may depend on the
+view::
+
+    x(n)     = sum_k h_k Y_k(n),              opacity(n) = sigmoid(l + x)
+    color(n) = max(0, c + sum_k k_k Y_k(n))   for each channel; k from 1 on, since o and c are of degree 0
+    alpha    = opacity(n) exp(-d^T Q d / 2)
+
+The squares of the harmonics of degree 1 to L add up to ``sum_k Y_k^2 = ((L + 1)^2 - 1) / (4 pi)`` for every n, so ``|x|
+<= B`` with ``B = |h| sqrt(((L + 1)^2 - 1) / (4 pi))``. A footprint is as large as that of the opacity ``o_B = sigmoid(l
++ B)``, and alpha is the alpha of that one times m: with ``w = exp(-(l + B))`` and ``e = exp(x - B)``::
+
+    alpha = o_B exp(-d^T Q d / 2) m,  m = e (1 + w) / (e + w),  1 - opacity(n) = w / (e + w)
+
+B needs no derivative, because a change of o_B and of m by B cancel.
 """
 
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
+from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response, Shading
 from minisplat_ref.reference.pinhole import pose
-from minisplat_ref.types import Camera, Floats, Ints
+from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints
 
+DEGREE = 3  # of textures, as in the paper
 LIMB = 0.1  # the last 5.7 degrees before the limb, which cover less than the last pixel of most Gaussians
 SCALE_MIN = 1e-9  # world units: thinner Gaussians count as this thin
+
+
+class TexturedGaussians(NamedTuple):
+    """Gaussians with textures; the other fields are those of :class:`Gaussians`."""
+
+    means: Floats
+    quats: Floats
+    log_scales: Floats
+    opacity_logits: Floats
+    """[N] coefficient l of degree 0 of the opacity's logit."""
+    sh_dc: Floats
+    sh_rest: Floats
+    color_textures: Floats
+    """[N, 3 (K-1)] coefficients k_k of degree 1 and above over the ellipsoid, those of red first."""
+    opacity_textures: Floats
+    """[N, K-1] coefficients h_k of degree 1 and above of the logit."""
+
+
+def add_textures(gaussians: Gaussians, degree: int) -> TexturedGaussians:
+    """Return Gaussians with textures of zeros up to a degree; with degree 0 they have none, and are those of 3DGS."""
+    n, dtype, k = len(gaussians.means), gaussians.means.dtype, (degree + 1) ** 2 - 1
+    return TexturedGaussians(
+        **{name: getattr(gaussians, name) for name in Gaussians._fields},
+        color_textures=np.zeros((n, 3 * k), dtype),
+        opacity_textures=np.zeros((n, k), dtype),
+    )
+
+
+def blank(gaussians: Gaussians, rng: np.random.Generator) -> TexturedGaussians:
+    """Return Gaussians with textures of zeros, of degree ``DEGREE``."""
+    return add_textures(gaussians, DEGREE)
 
 
 def inverse_intrinsics(camera: Camera, dtype: np.dtype) -> Floats:
@@ -217,3 +269,120 @@ def visible_frames_vjp(
     v_means, v_quats, v_scales = np.zeros_like(means), np.zeros_like(quats), np.zeros_like(scales)
     v_means[rows], v_quats[rows], v_scales[rows] = v.means, v.quats, v.scales
     return FrameGradient(v_means, v_quats, v_scales, v.cam_from_world_R, v.cam_from_world_t)
+
+
+def find_degree(n_coefficients: int) -> int:
+    """Return the degree L of ``(L + 1)^2 - 1`` coefficients."""
+    return math.isqrt(n_coefficients + 1) - 1
+
+
+def bounds(opacity_textures: Floats) -> Floats:
+    """Return B [N], the largest value that textures [N, K-1] can add to the logit."""
+    bound: Floats = np.linalg.norm(opacity_textures, axis=1)
+    return bound * bound.dtype.type(math.sqrt(opacity_textures.shape[1] / (4 * math.pi)))
+
+
+@dataclass(frozen=True)
+class TexturedFootprints(Footprints):
+    """The footprints of textured Gaussians.
+
+    The projection is that of the opacity o_B, compensated where the conventions require it.
+    """
+
+    logits: Floats
+    """[N] l."""
+    opacity_textures: Floats
+    """[N, K-1] h."""
+    frames: Floats
+    """[N, 3, 3] A."""
+
+    @property
+    def odds(self) -> Floats:
+        """[N] w, which may be infinite for Gaussians that are too faint to be seen."""
+        with np.errstate(over="ignore"):
+            return np.exp(-(self.logits + bounds(self.opacity_textures)))
+
+
+FIELDS = (*CONIC.fields, "logits", "opacity_textures", "frames")
+
+
+class Place(NamedTuple):
+    """The hits of P pixels on G Gaussians."""
+
+    conic: ConicPlace
+    meeting: Meeting
+    basis: Floats  # [G, P, K-1] Y_k(n) from degree 1 on
+    shares: Floats  # [G, P] m
+    transparencies: Floats  # [G, P] 1 - opacity(n)
+
+
+def hit(footprints: TexturedFootprints, ids: Ints, centers: Floats) -> Hit:
+    """Return the hits of footprints at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
+    flat = CONIC.hit(footprints.projection, ids, centers)
+    h = footprints.opacity_textures[ids]  # [G, K-1]
+    meeting = meet(footprints.frames[ids], footprints.means2d[ids], centers)
+    n, degree = meeting.directions, find_degree(h.shape[1])
+    basis = sh_basis(n.reshape(-1, 3), degree)[:, 1:].reshape(*n.shape[:2], h.shape[1])
+    e = np.exp(np.einsum("gk,gpk->gp", h, basis) - bounds(h)[:, None])
+    w = footprints.odds[ids, None]
+    shares, transparencies = e * (1 + w) / (e + w), w / (e + w)
+    return Hit(flat.unclamped * shares, flat.depths, Place(flat.place, meeting, basis, shares, transparencies))
+
+
+def hit_vjp(
+    footprints: TexturedFootprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_basis: Floats
+) -> tuple[Floats, ...]:
+    """Gradient of :func:`hit` with respect to ``FIELDS``; ``v_basis`` is the colours' derivative with respect to Y_k.
+
+    ::
+
+        v_E, v_o_B = those of the conic for m v_alpha
+        v_x   = alpha (1 - opacity(n)) v_alpha,  v_l = sum v_x,  v_h_k = sum Y_k v_x
+        v_Y_k = h_k v_x + the colours',  v_n = sum_k v_Y_k dY_k/dn, and from there to frames and centres
+    """
+    place: Place = hit.place
+    flat = Hit(hit.unclamped, hit.depths, place.conic)
+    v_means2d, v_conics, v_opacities = CONIC.hit_vjp(
+        footprints.projection, ids, flat, v_mean * place.shares, v_shape * place.shares, None
+    )
+    v_x = v_shape * hit.unclamped * place.transparencies  # [G, P]
+    h, n = footprints.opacity_textures[ids], place.meeting.directions
+    v_Y = v_x[:, :, None] * h[:, None] + v_basis
+    slopes = sh_basis_jacobian(n.reshape(-1, 3), find_degree(h.shape[1]))[:, 1:].reshape(*v_Y.shape, 3)
+    v_n = np.einsum("gpk,gpki->gpi", v_Y, slopes)
+    v_frames, v_centers = meet_vjp(footprints.frames[ids], footprints.means2d[ids], place.meeting, v_n)
+    v_h = np.einsum("gp,gpk->gk", v_x, place.basis)
+    return v_means2d + v_centers, v_conics, v_opacities, v_x.sum(axis=1), v_h, v_frames
+
+
+def shade(coefficients: Floats, place: Place) -> Floats:
+    """Return the channels [G, P, D] of ``coefficients`` [G, D K], which hold c and the k_k of each channel."""
+    return np.maximum(0, _unclamped(coefficients, place))
+
+
+def shade_vjp(coefficients: Floats, place: Place, v: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`shade` with respect to coefficients [G, D K] and Y_k [G, P, K-1].
+
+    It is zero where the channel was clamped, but not at zero itself, so that a colour of 3DGS that was clamped to zero
+    can still get a texture.
+    """
+    n_coefficients = place.basis.shape[2] + 1
+    v = np.where(_unclamped(coefficients, place) >= 0, v, 0)  # [G, P, D]
+    k = _split_channels(coefficients, n_coefficients)[:, :, 1:]  # [G, D, K-1]
+    v_base = v.sum(axis=1)[:, :, None]  # [G, D, 1]
+    v_k = np.einsum("gpd,gpk->gdk", v, place.basis)
+    v_coefficients = np.concatenate([v_base, v_k], axis=2).reshape(coefficients.shape)
+    return v_coefficients, np.einsum("gpd,gdk->gpk", v, k)
+
+
+def _unclamped(coefficients: Floats, place: Place) -> Floats:
+    by_channel = _split_channels(coefficients, place.basis.shape[2] + 1)
+    return by_channel[:, None, :, 0] + np.einsum("gdk,gpk->gpd", by_channel[:, :, 1:], place.basis)
+
+
+def _split_channels(coefficients: Floats, n_coefficients: int) -> Floats:
+    """Return ``coefficients`` [G, D K] as [G, D, K]."""
+    return coefficients.reshape(len(coefficients), coefficients.shape[1] // n_coefficients, n_coefficients)
+
+
+RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS, Shading(shade, shade_vjp))

@@ -1,14 +1,24 @@
-"""The events of OMG, and the recipe that uses them."""
+"""The distinctiveness of Gaussians and the pruning by it, the start of networks and codebooks, and the recipe.
+
+With the colours c_i of degree 0, in Morton order of the centres::
+
+    LD_i = 1/3 sum_channels |c_i - c_prev| + |c_i - c_next|
+    S_i  = I_i LD_i^lambda
+
+Morton order replaces a neighbour search and costs only a sort. It misses neighbours across the faces of large cells.
+Its cells have the proportions of the box that the centres fill, as in the released code.
+"""
 
 from collections.abc import Iterable
 from functools import partial
 
 import numpy as np
 
-from minisplat_ref.extensions.omg.decoding import SLOPE
-from minisplat_ref.extensions.omg.population import (
+from minisplat_ref.extensions.omg.codes import QUAT_MIN, fit_codes, nearest, unit_quats
+from minisplat_ref.extensions.omg.model import (
     CODEBOOKS,
     COLOR,
+    FIELDS,
     HARMONICS,
     N_SPACE,
     N_STATIC,
@@ -16,11 +26,11 @@ from minisplat_ref.extensions.omg.population import (
     OPACITY,
     PLACE,
     SIZES,
+    SLOPE,
     SPACE,
+    decode,
 )
-from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
-from minisplat_ref.extensions.omg.renderer import FIELDS, decode
-from minisplat_ref.extensions.omg.svq import QUAT_MIN, fit_codes, nearest, unit_quats
+from minisplat_ref.io.packing.morton import morton_order
 from minisplat_ref.mechanisms.networks.mlp import Layer, forward, from_shared
 from minisplat_ref.mechanisms.networks.networks import networks_for
 from minisplat_ref.methods.mini_splatting import (
@@ -42,6 +52,46 @@ MASS = 0.99  # tau of the paper's model M; XS has 0.96, XL 0.9999
 NETWORKS_FROM, PRUNING, CODES_FROM = 15_000, 20_000, 29_000  # iterations
 # The paper's scenes have hundreds of Gaussians for each code. With much fewer, a code takes more bytes than it saves.
 ROWS_PER_CODE = 8
+
+
+def local_distinctiveness(means: Floats, colors: Floats) -> Floats:
+    """Return the difference of each colour from those before and after it in Morton order.
+
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        World frame.
+    colors : ndarray of shape (N, 3)
+        Coefficients of degree 0, or any other features; the number of channels is arbitrary.
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        LD, float64, not negative. At either end of the order the only neighbour counts twice; 0 for N = 1.
+    """
+    n = len(means)
+    if n < 2:
+        return np.zeros(n)
+    order = morton_order(means, is_cubic=False)
+    ordered = colors[order].astype(np.float64)  # [N, C]
+    steps = np.abs(np.diff(ordered, axis=0)).mean(axis=1)  # [N - 1]
+    around = np.concatenate([steps[:1], steps, steps[-1:]])  # [N + 1] before and after each
+    distinctiveness = np.empty(n)
+    distinctiveness[order] = around[:-1] + around[1:]  # back to the rows: the inverse permutation
+    return distinctiveness
+
+
+def distinct_importance(importance: Floats, distinctiveness: Floats, power: float) -> Floats:
+    """Return the score ``S = I LD^lambda``.
+
+    Parameters
+    ----------
+    importance, distinctiveness : ndarray of shape (N,)
+        I and LD, not negative.
+    power : float
+        lambda; at 0 the score is the importance.
+    """
+    return importance * distinctiveness**power
 
 
 def prune_indistinct(
@@ -175,7 +225,7 @@ _prune = partial(prune_indistinct, metric=importance.indoor, distinct_mass=MASS,
 _start_codes = partial(start_codes, scale_codes=64, rotation_codes=512, feature_codes=1024, rows_per_code=ROWS_PER_CODE)
 
 
-def _with_ours(event: Event) -> tuple[Event, ...]:
+def _exchange(event: Event) -> tuple[Event, ...]:
     """Return an event of Mini-Splatting as OMG has it, and the events after it."""
     if does(event, prune_tail):
         return (event._replace(action=_prune),)
@@ -185,7 +235,7 @@ def _with_ours(event: Event) -> tuple[Event, ...]:
 OMG = MINI_SPLATTING._replace(
     name="omg",
     events=(
-        *(ours for event in MINI_SPLATTING.events for ours in _with_ours(event)),
+        *(ours for event in MINI_SPLATTING.events for ours in _exchange(event)),
         At(CODES_FROM, _start_codes),
         During(round_centres, start=CODES_FROM),
         During(write_fields, start=NETWORKS_FROM),
