@@ -48,9 +48,9 @@ from minisplat_ref.extensions.micro.model import trace_penalty, trace_penalty_vj
 from minisplat_ref.extensions.multi_scale.model import LEVELS, Plan, add_levels, are_shown, level_zero, pixel_densities
 from minisplat_ref.extensions.multi_scale.recipe import COVERAGE_MIN, finest_densities
 from minisplat_ref.extensions.omg.recipe import distinct_importance, local_distinctiveness
-from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
+from minisplat_ref.extensions.proxies.edit import Affine, edit_gaussians, make_rotation
 from minisplat_ref.io.packing.container import parse
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
@@ -375,7 +375,7 @@ bent_mesh = Mesh(roll(mesh.vertices), mesh.faces)
 binding = bind(card, mesh)
 bent = rebuild(bent_mesh, binding)
 moved = card._replace(means=bent.means)
-TILT = Affine(rotation_about((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
+TILT = Affine(make_rotation((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
 looking = card_camera()
 
 

@@ -36,7 +36,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.lens.method import THROUGH_LENS
 from minisplat_ref.extensions.wave.blending import Scene, blend
-from minisplat_ref.extensions.wave.sampling import propagate
+from minisplat_ref.extensions.wave.model import propagate
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
 from minisplat_ref.mechanisms.cameras.models import model_of, ray_table
 from minisplat_ref.mechanisms.cameras.ray_footprints import hit

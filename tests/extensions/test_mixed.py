@@ -18,18 +18,21 @@ from minisplat_ref.cpu.compositing.plain_conic import composite as composite_con
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.mixed.kernels import response_for
-from minisplat_ref.extensions.mixed.kinds import coverage, promote_kinds, simplify_kinds, whiten_vertices
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simplify_hulls
+from minisplat_ref.extensions.mixed.kernels import make_response
+from minisplat_ref.extensions.mixed.model import MIXED_GAUSSIANS, promote, simplify_hulls
 from minisplat_ref.extensions.mixed.population import (
     MixedGaussians,
-    as_ellipses,
+    convert_to_lab,
     counts,
+    coverage,
     group_gaussians,
     groups,
-    to_lab,
+    make_ellipses,
+    promote_kinds,
+    simplify_kinds,
+    whiten_vertices,
 )
-from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp, in_plane
+from minisplat_ref.extensions.mixed.projection import Hulls, footprints_vjp, place_vertices, project_hulls
 from minisplat_ref.extensions.mixed.response import INSIDE, RESPONSE, HullFootprints, nearest
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
@@ -138,7 +141,7 @@ def test_one_vertex_is_the_conic_of_3dgs_to_the_last_byte(rng):
     g = make_gaussians(rng, n)
     primitives = Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
     projection = REFERENCE.project(*primitives, camera, GSPLAT_MAIN)
-    hulls = footprints_of(Hulls(primitives, rng.normal(size=(n, 4)), np.ones(n, int)), projection, camera, GSPLAT_MAIN)
+    hulls = project_hulls(Hulls(primitives, rng.normal(size=(n, 4)), np.ones(n, int)), projection, camera, GSPLAT_MAIN)
     ids, centers = np.flatnonzero(projection.radii[:, 0]), rng.uniform(0, 20, size=(50, 2))
     ours, theirs = RESPONSE.hit(hulls, ids, centers), CONIC.hit(projection, ids, centers)
     assert theirs.unclamped.max() > 0.1 and ours.unclamped.tobytes() == theirs.unclamped.tobytes()
@@ -148,7 +151,7 @@ def test_one_vertex_is_the_conic_of_3dgs_to_the_last_byte(rng):
         assert_allclose(found, expected, rtol=CLOSED_FORM)
     bins = bin_gaussians(projection, TileGrid(camera.width, camera.height, 32, 16), GSPLAT_MAIN)
     scene = rng.uniform(size=(n, 3)), np.zeros(3), bins, GSPLAT_MAIN
-    by_kernels = composite_by_kernels(response_for(np.dtype(float)), hulls, *scene)
+    by_kernels = composite_by_kernels(make_response(np.dtype(float)), hulls, *scene)
     assert by_kernels.image.tobytes() == composite_conics(projection, *scene).image.tobytes()
 
 
@@ -183,7 +186,7 @@ def test_the_gradient_of_the_vertices(rng):
     def function(vertices, means, quats, R, t):
         moved, hulls = camera._replace(cam_from_world_R=R, cam_from_world_t=t), hulls_of(vertices, means, quats)
         return (
-            footprints_of(hulls, REFERENCE.project(*hulls.primitives, moved, GSPLAT_MAIN), moved, GSPLAT_MAIN).vertices,
+            project_hulls(hulls, REFERENCE.project(*hulls.primitives, moved, GSPLAT_MAIN), moved, GSPLAT_MAIN).vertices,
         )
 
     inputs = [vertices, means, quats, camera.cam_from_world_R, camera.cam_from_world_t]
@@ -202,7 +205,7 @@ def test_the_gradient_of_the_vertices(rng):
 def hard_hulls():
     """Empty, on a line, edge on, a needle, behind the camera in part, around a pixel, off the image but for an end."""
     n = 7
-    population = as_ellipses(make_gaussians(np.random.default_rng(4), n, sh_degree=0, opacity_logit=0.0))
+    population = make_ellipses(make_gaussians(np.random.default_rng(4), n, sh_degree=0, opacity_logit=0.0))
     turned = np.array([[np.sqrt(0.5), 0, np.sqrt(0.5), 0]])  # its plane holds the line of sight
     quats = np.repeat(np.eye(4)[:1], n, axis=0)
     quats[2] = turned
@@ -247,7 +250,7 @@ def test_an_empty_hull_is_its_ellipse_and_a_flat_one_its_longest_line(rng):
 def test_a_hull_far_below_a_pixel_is_drawn_by_its_low_pass(backend):
     """Its footprint is the low-pass, a covariance of 0.3 pixels squared whose determinant is 0.09."""
     camera = turned_camera(cx=17.5, cy=12.5)
-    speck = as_ellipses(balls(in_front_of(camera, [0, 0, 5.0]), [1e-7], [0.8], [[1.0, 1.0, 1.0]]))
+    speck = make_ellipses(balls(in_front_of(camera, [0, 0, 5.0]), [1e-7], [0.8], [[1.0, 1.0, 1.0]]))
     speck = speck._replace(vertices=np.array([[1e-7, 0, 0, 1e-7]]), n_vertices=np.array([3.0]))
     image = RENDERER.render(Model(speck), view_from(camera), Request(backend=backend))[0].image
     assert_allclose(image[12, 17:19, 0], [0.8, 0.8 * np.exp(-0.5 / 0.3)], rtol=1e-4)
@@ -268,7 +271,7 @@ def test_near_points_of_like_colour_become_one():
     gray, red = np.full(3, 0.5), np.array([0.9, 0.1, 0.1])
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [5, 5, 6], [5, 6, 5], [20, 0, 0.0]])
     colors = np.array([gray, gray + 0.01, gray, gray, red, gray, red])
-    assert groups(points, to_lab(colors)).tolist() == [[0, 1, 2], [3, 5, -1], [4, -1, -1], [6, -1, -1]]
+    assert groups(points, convert_to_lab(colors)).tolist() == [[0, 1, 2], [3, 5, -1], [4, -1, -1], [6, -1, -1]]
 
 
 def test_of_three_points_each_two_must_be_alike():
@@ -336,15 +339,15 @@ def test_colours_are_those_that_are_seen(grey, n, rng):
 
 
 def test_numbers_of_vertices_are_one_to_three(rng):
-    population = as_ellipses(make_gaussians(rng, 4))._replace(n_vertices=np.array([0.2, 1.6, 2.4, 3.7]))
+    population = make_ellipses(make_gaussians(rng, 4))._replace(n_vertices=np.array([0.2, 1.6, 2.4, 3.7]))
     assert counts(population).tolist() == [1, 2, 2, 3]
 
 
 def test_lab_of_known_colours():
-    found = to_lab(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, 0.2, 0.2]]))
+    found = convert_to_lab(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, 0.2, 0.2]]))
     expected = [[100, 0, 0], [0, 0, 0], [53.24, 80.09, 67.2], [32.3, 79.19, -107.86], [21.25, 0, 0]]
     assert_allclose(found, expected, atol=0.05)  # tables have two digits
-    assert_allclose(to_lab(np.full((1, 3), 0.02))[0, 0], 903.296 * 0.02 / 12.92, atol=1e-3)  # the straight part
+    assert_allclose(convert_to_lab(np.full((1, 3), 0.02))[0, 0], 903.296 * 0.02 / 12.92, atol=1e-3)  # the straight part
 
 
 def test_a_group_has_its_points_for_vertices(rng):
@@ -353,7 +356,7 @@ def test_a_group_has_its_points_for_vertices(rng):
     population = group_gaussians(g, rng)
     m = counts(population)
     assert m.sum() == 40 and set(m) == {1, 2, 3} and population.means.dtype == np.float32
-    local = in_plane(population.vertices, m)
+    local = place_vertices(population.vertices, m)
     corners = population.means[:, None] + np.einsum(
         "nij,nkj->nki", rotation_matrices(population.quats)[:, :, :2], local
     )
@@ -362,7 +365,7 @@ def test_a_group_has_its_points_for_vertices(rng):
 
 
 def test_hulls_that_make_no_difference_lose_vertices(rng):
-    one = as_ellipses(make_gaussians(rng, 4))._replace(log_scales=np.zeros((4, 3)))
+    one = make_ellipses(make_gaussians(rng, 4))._replace(log_scales=np.zeros((4, 3)))
     vertices = np.array([[0.1, 0.1, -0.1, 0.0], [3.0, 0.1, -1.0, 0.0], [0.1, 0.1, 7.0, 7.0], [3, 0.0, 0.0, 3.0]])
     population = one._replace(vertices=vertices, n_vertices=np.array([3, 3, 2, 3.0]))
     after, changed = simplify_kinds(population, least=0.5, min_height=0.5)
@@ -379,7 +382,7 @@ def test_hulls_that_make_no_difference_lose_vertices(rng):
 def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
     """Whatever the order of the axes; the image from the front stays nearly the same."""
     log_scales = np.log([[0.05, 0.8, 0.05], [0.3, 0.01, 0.35], [0.3, 0.3, 0.3], [0.01, 0.01, 0.09]])
-    population = as_ellipses(make_gaussians(rng, 4))._replace(log_scales=log_scales)
+    population = make_ellipses(make_gaussians(rng, 4))._replace(log_scales=log_scales)
     after, changed = promote_kinds(population, ratio=6.0, size_limit=0.2)
     assert changed.tolist() == [True, True, False, False] and counts(after).tolist() == [2, 3, 1, 1]
     largest_two = np.sort(log_scales, axis=1)[:2, 1:].sum(axis=1)
@@ -396,14 +399,14 @@ def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
 @pytest.mark.parametrize("scales", [[0.5, 0.21, 0.01], [0.25, 0.15, 0.01], [0.3, 0.29, 0.06]])
 def test_what_is_no_disc_stays(scales, rng):
     """Longer than twice its width, not as wide as the limit, or not six times as thin."""
-    population = as_ellipses(make_gaussians(rng, 1))._replace(log_scales=np.log([scales]))
+    population = make_ellipses(make_gaussians(rng, 1))._replace(log_scales=np.log([scales]))
     assert not promote_kinds(population, ratio=6.0, size_limit=0.2)[1].any()
 
 
 def test_the_recipe_promotes_what_is_six_times_as_long_as_wide_and_a_hundredth_of_the_extent():
     """In a scene of extent 2 from 0.02 on. What changes its shape loses the moments of its shape, and no others."""
     widths = [[0.06, 0.0101, 0.0101], [0.0606, 0.01, 0.01], [0.019, 0.003, 0.003], [0.021, 0.003, 0.003]]
-    gaussians = as_ellipses(balls(np.zeros((4, 3)), np.ones(4), np.full(4, 0.5)))
+    gaussians = make_ellipses(balls(np.zeros((4, 3)), np.ones(4), np.full(4, 0.5)))
     state = state_of(gaussians._replace(log_scales=np.log(widths)))
     for moment in (state.adam.first, state.adam.second):
         for field in moment:
@@ -421,7 +424,7 @@ def test_the_recipe_simplifies_within_half_a_deviation():
 
     The mean of a triangle's vertices is at a third of its altitude.
     """
-    gaussians = as_ellipses(balls(np.zeros((4, 3)), np.full(4, 0.1), np.full(4, 0.5)))
+    gaussians = make_ellipses(balls(np.zeros((4, 3)), np.full(4, 0.1), np.full(4, 0.5)))
     lines, triangles = ([[h / 2, 0, 0, 0] for h in (0.49, 0.51)], [[3, -h / 3, 0, 2 * h / 3] for h in (0.49, 0.51)])
     vertices, n_vertices = 0.1 * np.array([*lines, *triangles]), np.array([2, 2, 3, 3.0])
     state = state_of(gaussians._replace(vertices=vertices, n_vertices=n_vertices))

@@ -10,12 +10,10 @@ from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.planes import KAPPA, Planes, planes_of, planes_vjp
-from minisplat_ref.extensions.mixed.population import as_ellipses
-from minisplat_ref.extensions.mixed.projection import Hulls, in_plane
-from minisplat_ref.extensions.mixed.surfaces import FIELDS, SurfaceFootprints, surface_response
+from minisplat_ref.extensions.mixed.model import MIXED_GAUSSIANS, mix_kinds
+from minisplat_ref.extensions.mixed.population import make_ellipses
+from minisplat_ref.extensions.mixed.projection import KAPPA, Hulls, Planes, fit_planes, place_vertices, planes_vjp
+from minisplat_ref.extensions.mixed.response import SURFACE_FIELDS, SurfaceFootprints, surface_response
 from minisplat_ref.mechanisms.surfels.losses import distortion
 from minisplat_ref.mechanisms.surfels.response import Layout
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -39,7 +37,7 @@ def hulls_at(camera, place, quat, scales, vertices=(0.0, 0, 0, 0), n_vertices=1)
 
 
 def found_planes(hulls, camera, conventions=SHARP):
-    planes, normals = planes_of(hulls, np.arange(len(hulls.n_vertices)), camera, conventions)
+    planes, normals = fit_planes(hulls, np.arange(len(hulls.n_vertices)), camera, conventions)
     return planes[0], normals[0]
 
 
@@ -75,7 +73,7 @@ def test_a_ball_faces_the_camera():
 def test_a_triangle_has_the_variance_of_all_its_points():
     """That of (0, 0), (1, 0), (0, 1) is 1/18 along each axis, the covariance -1/36; of a segment of 1 it is 1/12."""
     right, segment = np.array([[2 / 3, -1 / 3, -1 / 3, 2 / 3], [0.5, 0, 0, 0]]), np.array([3, 2])
-    ab = in_plane(right, segment)
+    ab = place_vertices(right, segment)
     found = KAPPA[segment, None, None] * np.einsum("nki,nkj->nij", ab, ab)
     assert_allclose(found[0], [[1 / 18, -1 / 36], [-1 / 36, 1 / 18]], rtol=CLOSED_FORM)
     assert_allclose(found[1], [[1 / 12, 0], [0, 0]], rtol=CLOSED_FORM, atol=CLOSED_FORM)
@@ -105,11 +103,11 @@ def test_far_below_a_pixel_and_from_the_edge_planes_face_the_camera():
 
 def test_depths_stay_within_the_deviations_of_the_primitive(rng):
     """Cauchy and Schwarz: |h . d| is at most the deviation of depth times the length of d in deviations of B."""
-    camera, g = make_camera(rng=rng), of_all_kinds(make_gaussians(rng, 40), rng)
+    camera, g = make_camera(rng=rng), mix_kinds(make_gaussians(rng, 40), rng)
     primitives = Primitives(g.means, g.quats, np.exp(g.log_scales), np.ones(40))
     kinds = g.n_vertices.astype(int)
-    planes, _ = planes_of(Hulls(primitives, g.vertices, kinds), np.arange(40), camera, GSPLAT_MAIN)
-    reach = np.exp(g.log_scales).max(axis=1) ** 2 + np.sum(in_plane(g.vertices, kinds) ** 2, axis=(1, 2)) / 6
+    planes, _ = fit_planes(Hulls(primitives, g.vertices, kinds), np.arange(40), camera, GSPLAT_MAIN)
+    reach = np.exp(g.log_scales).max(axis=1) ** 2 + np.sum(place_vertices(g.vertices, kinds) ** 2, axis=(1, 2)) / 6
     slopes = np.linalg.norm(planes[:, 1:] / planes[:, :1], axis=1)  # |h|; a pixel is at most 1 / sqrt(eps) deviations
     assert (slopes <= np.sqrt(reach / GSPLAT_MAIN.eps2d)).all() and slopes.max() > 0.01
 
@@ -123,7 +121,7 @@ def test_the_gradient_of_planes(rng):
 
     def function(vertices, means, quats, scales, R, t):
         moved = camera._replace(cam_from_world_R=R, cam_from_world_t=t)
-        return tuple(planes_of(hulls_of(vertices, means, quats, scales), rows, moved, GSPLAT_MAIN))
+        return tuple(fit_planes(hulls_of(vertices, means, quats, scales), rows, moved, GSPLAT_MAIN))
 
     inputs = [rng.normal(size=(3, 4)), means, rng.normal(size=(3, 4)), scales]
     check_jacobian(
@@ -172,7 +170,7 @@ def test_the_gradient_of_the_response_with_depths(rng):
         return response.hit_vjp(footprints, one, found, v, v, v_depths)
 
     assert response.hit(footprints, one, centers).place.is_bounded.any()
-    check_jacobian(function, vjp, [getattr(footprints, name) for name in FIELDS], names=list(FIELDS))
+    check_jacobian(function, vjp, [getattr(footprints, name) for name in SURFACE_FIELDS], names=list(SURFACE_FIELDS))
 
 
 # --- the renderer ---
@@ -181,7 +179,7 @@ def test_the_gradient_of_the_response_with_depths(rng):
 def test_colours_are_the_same_with_depths_and_without(backend, rng):
     """Of all kinds, and of ellipses alone, which 3DGS renders."""
     g, view = make_gaussians(rng, 40), view_from(make_camera(rng=rng))
-    for population in (of_all_kinds(g, rng), as_ellipses(g)):
+    for population in (mix_kinds(g, rng), make_ellipses(g)):
         alone, more = (
             RENDERER.render(Model(population), view, Request(backend=backend, wants=wants))[0]
             for wants in (frozenset(), WANTS)
@@ -193,7 +191,7 @@ def test_colours_are_the_same_with_depths_and_without(backend, rng):
 def test_depths_and_normals_of_one_triangle_in_an_image(backend):
     """Without the low-pass each pixel shows the plane: w z, w n, w (1/z - q_0) and its square, w the opacity 0.9."""
     camera = turned_camera()
-    one = as_ellipses(balls(in_front_of(camera, [0.4, -0.3, 4.0]), [0.3], [0.9]))
+    one = make_ellipses(balls(in_front_of(camera, [0.4, -0.3, 4.0]), [0.3], [0.9]))
     one.log_scales[0, 2] = np.log(1e-9)
     one = one._replace(
         quats=np.array([[0.9, 0.3, -0.5, 0.1]]), vertices=np.array([[1.0, 0.3, -0.2, 0.8]]), n_vertices=np.full(1, 3.0)
@@ -215,7 +213,7 @@ def test_depths_and_normals_of_one_triangle_in_an_image(backend):
 
 @pytest.mark.parametrize(("dtype", "rel"), [(np.float64, PARITY_FLOAT64), (np.float32, 10 * PARITY_FLOAT32_IMAGE)])
 def test_kernels_and_reference_agree_in_all_channels(dtype, rel, rng):
-    population, view = of_all_kinds(make_gaussians(rng, 40), rng), view_from(make_camera(rng=rng))
+    population, view = mix_kinds(make_gaussians(rng, 40), rng), view_from(make_camera(rng=rng))
     slices, wants = RENDERER.channels(WANTS), WANTS | {"median_depth"}
     ours, theirs = (
         RENDERER.render(Model(as_dtype(population, of)), view, Request(backend=backend, wants=wants))[0]
@@ -234,7 +232,7 @@ def test_kernels_and_reference_agree_in_all_channels(dtype, rel, rng):
 def test_the_distortion_of_a_triangle_in_front_of_a_ball(backend):
     """Alphas 0.5 and 0.8 at z = 2 and z = 4: w_1 w_2 (m_1 - m_2)^2 with m = 100 / 99.8 (1 - 0.2 / z)."""
     camera = make_camera(24, 24, cx=12.5, cy=12.5)
-    two = as_ellipses(balls(in_front_of(camera, [[0, 0, 2.0], [0, 0, 4.0]]), [0.2, 40.0], [0.5, 0.8]))
+    two = make_ellipses(balls(in_front_of(camera, [[0, 0, 2.0], [0, 0, 4.0]]), [0.2, 40.0], [0.5, 0.8]))
     two.log_scales[0, 2] = -16
     two = two._replace(vertices=np.array([[1.0, -1, 0, 1.5], [0] * 4]), n_vertices=np.array([3.0, 1]))
     view, request = view_from(camera), Request(backend=backend, conventions=GSPLAT_MAIN, wants=frozenset({"spread"}))

@@ -11,10 +11,16 @@ from data_tools.fuzz.readers import Reader, mutant
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, in_box, rotation_about
-from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
+from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, nearest_triangles, rebuild, triangle_distances
 from minisplat_ref.extensions.proxies.cage import convex_hull, grid, sheet_through
-from minisplat_ref.extensions.proxies.nearest import nearest_triangles, triangle_distances
+from minisplat_ref.extensions.proxies.edit import (
+    Affine,
+    are_in_ball,
+    are_in_box,
+    edit_gaussians,
+    make_affine,
+    make_rotation,
+)
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.mechanisms.editing.deformation import polar_rotations, quaternions
 from minisplat_ref.mechanisms.editing.sh_rotation import sh_rotations
@@ -28,9 +34,9 @@ from scenes import as_dtype, balls, make_camera, make_gaussians
 from tolerances import AFFINE_EDIT, CLOSED_FORM, COVERAGE_MIN, EDITED_IMAGE, PARITY_FLOAT32_PROJECTION
 
 LINEAR = {  # A of x -> A x + b
-    "rotation": rotation_about((20, -50, 70)),
-    "rotation and scale": 1.7 * rotation_about((20, -50, 70)),
-    "reflection": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5, 6, 7)),
+    "rotation": make_rotation((20, -50, 70)),
+    "rotation and scale": 1.7 * make_rotation((20, -50, 70)),
+    "reflection": np.diag([1.0, -1.0, 1.0]) @ make_rotation((5, 6, 7)),
     "stretch": np.diag([0.3, 1.0, 4.0]),
     "shear": np.array([[1.0, 0.8, -0.3], [0.0, 1.0, 0.5], [0.2, 0.0, 1.0]]),
 }
@@ -66,7 +72,7 @@ def flat_sheet(n=4):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_rotated_colours_are_those_of_the_direction_rotated_back(sign, rng):
     """f'(Q d) = f(d) holds for each degree by itself."""
-    Q = sign * rotation_about(tuple(rng.uniform(-180, 180, 3)))
+    Q = sign * make_rotation(tuple(rng.uniform(-180, 180, 3)))
     d = rng.normal(size=(40, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     for degree, D in enumerate(sh_rotations(Q[None], 3), 1):
@@ -79,14 +85,14 @@ def test_rotated_colours_are_those_of_the_direction_rotated_back(sign, rng):
 
 def test_the_rotation_of_degree_one_is_the_matrix_itself(rng):
     """Since Y_1 = C (-y, z, -x), D_1 is Q with its axes in that order."""
-    Q = rotation_about((30, 40, 50))
+    Q = make_rotation((30, 40, 50))
     order, signs = [1, 2, 0], np.array([-1.0, 1.0, -1.0])
     expected = signs[:, None] * Q[np.ix_(order, order)] * signs
     assert_allclose(sh_rotations(Q[None], 1)[0][0], expected, atol=CLOSED_FORM)
 
 
 def test_rotations_of_colours_compose_and_are_orthogonal(rng):
-    P, Q = rotation_about((30, 40, 50)), rotation_about((-80, 10, 5))
+    P, Q = make_rotation((30, 40, 50)), make_rotation((-80, 10, 5))
     for D in sh_rotations(np.stack([P, Q, P @ Q]), 3):
         assert_allclose(D[0] @ D[1], D[2], atol=CLOSED_FORM)
         assert_allclose(D[2] @ D[2].T, np.eye(D.shape[1]), atol=CLOSED_FORM)
@@ -120,9 +126,9 @@ def test_nothing_and_what_is_not_selected_keep_their_bytes(dtype, rng):
     gaussians = as_dtype(make_gaussians(rng, 50), dtype)
     everything, some = all_of(gaussians), rng.random(50) < 0.5
     assert is_same(
-        edit_gaussians(gaussians, about_point(np.eye(3), rng.normal(size=3), np.zeros(3)), everything), gaussians
+        edit_gaussians(gaussians, make_affine(np.eye(3), rng.normal(size=3), np.zeros(3)), everything), gaussians
     )
-    assert_array_equal(rotation_about((0.0, 0.0, 0.0)), np.eye(3), strict=True)
+    assert_array_equal(make_rotation((0.0, 0.0, 0.0)), np.eye(3), strict=True)
     moved = edit_gaussians(gaussians, Affine(np.eye(3), SHIFT), everything)
     assert is_same(moved[1:], gaussians[1:]) and not (moved.means == gaussians.means).any()
     part = edit_gaussians(gaussians, Affine(LINEAR["shear"], SHIFT), some)
@@ -153,7 +159,7 @@ def test_an_edit_and_its_inverse_cancel(rng):
 def test_a_rotated_scene_looks_as_from_a_camera_rotated_back(scale, rng):
     """With R_c' = R_c Q^T and t_c' = s t_c - R_c Q^T b, shapes, places, order and colours of every degree agree."""
     gaussians, camera = make_gaussians(rng, 60), make_camera(rng=rng)
-    Q = rotation_about((20, -50, 70))
+    Q = make_rotation((20, -50, 70))
     turned = edit_gaussians(gaussians, Affine(scale * Q, SHIFT), all_of(gaussians))
     R = camera.cam_from_world_R @ Q.T
     moved = camera._replace(cam_from_world_R=R, cam_from_world_t=scale * camera.cam_from_world_t - R @ SHIFT)
@@ -195,14 +201,14 @@ def test_maps_without_an_inverse_are_refused(A, rng):
 
 def test_the_fixed_point_stays(rng):
     pivot = rng.normal(size=3)
-    A, b = about_point(LINEAR["shear"], pivot, SHIFT)
+    A, b = make_affine(LINEAR["shear"], pivot, SHIFT)
     assert_allclose(A @ pivot + b, pivot + SHIFT, atol=CLOSED_FORM)
 
 
 def test_selections():
     means = np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [1, 0, 0]])
-    assert_array_equal(in_box(means, np.zeros(3), np.ones(3)), [True, True, False, True])
-    assert_array_equal(in_ball(means, np.zeros(3), 1.0), [True, False, False, True])
+    assert_array_equal(are_in_box(means, np.zeros(3), np.ones(3)), [True, True, False, True])
+    assert_array_equal(are_in_ball(means, np.zeros(3), 1.0), [True, False, False, True])
 
 
 # Nearest triangles
@@ -390,7 +396,7 @@ def test_edit_from_the_command_line(model, tmp_path, capsys):
     assert run("edit", model, out, *options, "--about", 0, 0, 3) == 0
     is_selected = before.means[:, 0] <= 0
     assert f"{is_selected.sum()} of 60 Gaussians edited" in capsys.readouterr().out
-    affine = about_point(2 * rotation_about((0, 30, 0)), np.array([0.0, 0, 3]), np.array([-1.0, 0, 0]))
+    affine = make_affine(2 * make_rotation((0, 30, 0)), np.array([0.0, 0, 3]), np.array([-1.0, 0, 0]))
     assert is_same(load_ply(out), edit_gaussians(before, affine, is_selected))
     assert run("edit", model, out, "--sphere", 0, 0, 3, 0.7, "--matrix", 1, 0.5, 0, 0, 1, 0, 0, 0, 1) == 0
     assert run("edit", model, out, "--scale", 1, 2, 3) == 0

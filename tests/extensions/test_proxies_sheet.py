@@ -10,22 +10,20 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.extensions.proxies import fall as fall_command
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
+from minisplat_ref.extensions.proxies.fall import Setting, make_sheet
 from minisplat_ref.extensions.proxies.mass_spring import (
     Floor,
     Sheet,
     State,
+    Stiffness,
+    choose_stiffness,
+    connect,
     energies,
+    find_springs,
     forces,
     integrate,
     longest_step,
-)
-from minisplat_ref.extensions.proxies.springs import (
-    Stiffness,
-    find_springs,
-    springs_between,
-    springs_of,
-    stiffness_for_stretch,
+    make_springs,
     vertex_masses,
 )
 from minisplat_ref.io.images import read_image
@@ -46,7 +44,7 @@ def noisy_sheet(rng, **changes):
     """Return a crumpled sheet with everything that a sheet may have, and its positions."""
     mesh = flat_sheet()
     setting = Setting(G, mesh.vertices[:, 1] < -0.9, 0.05, 0.7, 0.1)
-    sheet = sheet_of(mesh, setting)._replace(**changes)
+    sheet = make_sheet(mesh, setting)._replace(**changes)
     return mesh, sheet, mesh.vertices + 0.3 * rng.normal(size=mesh.vertices.shape)
 
 
@@ -54,7 +52,7 @@ def hanging_chain(n, k, drag):
     """Return n equal masses of weight 1 below a pin, with a spring of length 1 between neighbours."""
     vertices = np.column_stack([np.zeros(n + 1), np.arange(n + 1.0), np.zeros(n + 1)])
     ends = np.column_stack([np.arange(n), np.arange(1, n + 1)])
-    springs = springs_between(ends, vertices, np.full(n, k))
+    springs = connect(ends, vertices, np.full(n, k))
     return vertices, Sheet(np.full(n + 1, 1 / 9.81), springs, np.arange(n + 1) == 0, G, drag)
 
 
@@ -103,7 +101,7 @@ def test_the_stiffness_of_a_sheet_by_hand():
     mesh = grid(np.array([5.0, -3, 7]), np.array([0.0, 2.0, 0]), np.array([0, 0, 1.0]), (1, 1))
     edge = (6 + np.sqrt(5)) / 5
     k = 25 / edge**2
-    assert_allclose(stiffness_for_stretch(mesh, 10.0, 0.1), [k, k, k / 100], rtol=CLOSED_FORM)
+    assert_allclose(choose_stiffness(mesh, 10.0, 0.1), [k, k, k / 100], rtol=CLOSED_FORM)
 
 
 # Forces
@@ -137,7 +135,7 @@ def test_springs_exert_neither_a_net_force_nor_a_net_torque(rng):
 
 
 def test_a_spring_of_no_length_has_no_force():
-    springs = springs_between(np.array([[0, 1]]), np.array([[0.0, 0, 0], [1, 0, 0]]), np.ones(1))
+    springs = connect(np.array([[0, 1]]), np.array([[0.0, 0, 0], [1, 0, 0]]), np.ones(1))
     sheet = Sheet(np.ones(2), springs, np.zeros(2, bool), np.zeros(3))
     assert not forces(np.zeros((2, 3)), sheet).any()
 
@@ -147,7 +145,7 @@ def test_a_spring_of_no_length_has_no_force():
 
 def test_free_fall_is_exact_and_carries_the_gaussians(rng):
     mesh = flat_sheet()
-    sheet = sheet_of(mesh, Setting(G, np.zeros(len(mesh.vertices), bool), 0.01, 0.0, None))
+    sheet = make_sheet(mesh, Setting(G, np.zeros(len(mesh.vertices), bool), 0.01, 0.0, None))
     v = np.array([0.2, -1.0, 0.4])
     state = integrate(State(mesh.vertices, np.broadcast_to(v, mesh.vertices.shape)), sheet, 0.5 / 400, 400)
     way = 0.5 * v + 0.125 * G
@@ -191,7 +189,7 @@ def test_a_chain_comes_to_rest_where_it_should():
 
 def test_a_sheet_lies_on_the_floor():
     mesh = grid(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), (3, 3))
-    sheet = sheet_of(mesh, Setting(G, np.zeros(16, bool), 0.01, 1.0, 0.2))
+    sheet = make_sheet(mesh, Setting(G, np.zeros(16, bool), 0.01, 1.0, 0.2))
     state = integrate(State(mesh.vertices, np.zeros((16, 3))), sheet, 0.5 * longest_step(sheet), 4000)
     sunk = state.positions[:, 1] - 0.2
     assert_allclose(np.sum(sunk * sheet.floor.stiffness), sheet.masses.sum() * 9.81, rtol=1e-3)
@@ -204,7 +202,7 @@ def test_a_sheet_lies_on_the_floor():
 def test_the_floor_slows_down_only_what_is_below_it():
     """For one unit of time: e^(-1/2) above the floor and upon it, e^(-5/2) below, where 2 is added to the drag."""
     vertices = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # gravity is along y
-    springs = springs_between(np.array([[0, 1]]), vertices, np.zeros(1))
+    springs = connect(np.array([[0, 1]]), vertices, np.zeros(1))
     masses, floor = np.array([1.0, 2.0, 4.0]), Floor(0.0, 0.0, 2.0)
     sheet = Sheet(masses, springs, np.array([False, True, False]), np.array([0.0, 1e-12, 0.0]), 0.5, floor)
     v = np.array([[3.0, 0, 0], [0, 0, 3.0], [3.0, 0, 0]])
@@ -229,7 +227,7 @@ def test_without_drag_nothing_is_dissipated_and_with_it_everything_is(rng):
 def test_the_longest_step_is_that_of_stability(rng):
     """Just below it the sheet stays, and not far above it explodes."""
     mesh = flat_sheet()
-    sheet = sheet_of(mesh, Setting(G, mesh.vertices[:, 1] < -0.9, 0.05, 0.0, None))
+    sheet = make_sheet(mesh, Setting(G, mesh.vertices[:, 1] < -0.9, 0.05, 0.0, None))
     start = State(mesh.vertices + 1e-3 * rng.normal(size=mesh.vertices.shape), np.zeros_like(mesh.vertices))
     with np.errstate(all="ignore"):
         sizes = [np.abs(integrate(start, sheet, f * longest_step(sheet), 300).velocities).max() for f in (0.99, 2.0)]
@@ -254,12 +252,12 @@ def test_the_bound_of_the_step_holds_and_is_met(rng):
 def test_a_sheet_stretches_as_much_as_was_asked(rng):
     mesh = grid(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), (6, 6))
     masses = vertex_masses(mesh, 1.0)
-    stiffness = stiffness_for_stretch(mesh, float(masses.sum()) * 9.81, 0.02)
-    sheet = Sheet(masses, springs_of(mesh, stiffness), mesh.vertices[:, 1] < 1e-9, G, 10.0)
+    stiffness = choose_stiffness(mesh, float(masses.sum()) * 9.81, 0.02)
+    sheet = Sheet(masses, make_springs(mesh, stiffness), mesh.vertices[:, 1] < 1e-9, G, 10.0)
     end = integrate(State(mesh.vertices, np.zeros_like(mesh.vertices)), sheet, 0.5 * longest_step(sheet), 3000)
     assert 0.005 < end.positions[:, 1].max() - 1 < 0.04  # "about": diagonals help, corners pull
     assert isinstance(stiffness, Stiffness) and stiffness.bend < stiffness.shear
-    assert len(springs_of(mesh, stiffness._replace(bend=0.0)).stiffness) < len(sheet.springs.stiffness)
+    assert len(make_springs(mesh, stiffness._replace(bend=0.0)).stiffness) < len(sheet.springs.stiffness)
 
 
 # The command

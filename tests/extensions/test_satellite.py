@@ -11,11 +11,18 @@ from data_tools.claims.satellite import boxes
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite import affine_fit, reference, rpc, utm
-from minisplat_ref.extensions.satellite.gradient_checks import stages
-from minisplat_ref.extensions.satellite.losses import opacity_sparsity, shadow_entropy
-from minisplat_ref.extensions.satellite.method import SEEN_FROM_ABOVE, begin_transparent, fold_reference, hold_sky
-from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite import cameras
+from minisplat_ref.extensions.satellite import model as formulas
+from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.recipe import (
+    SEEN_FROM_ABOVE,
+    begin_transparent,
+    fold_reference,
+    hold_sky,
+    opacity_sparsity,
+    shadow_entropy,
+    stages,
+)
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
 from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.pieces import tiny_setting
@@ -37,20 +44,20 @@ FINE = 1e-8  # central differences of step 1e-5 on values near 1
 def test_utm_of_a_known_tower():
     """The CN Tower, 43 38 33.24 N, 79 23 13.7 W, is at 630084 E, 4833438 N of zone 17, to the metre."""
     longitude, latitude = -(79 + 23 / 60 + 13.7 / 3600), 43 + 38 / 60 + 33.24 / 3600
-    assert utm.zone_of(longitude) == 17
-    found = utm.utm_from_degrees(np.array([longitude]), np.array([latitude]), 17, is_south=False)
+    assert cameras.find_zone(longitude) == 17
+    found = cameras.utm_from_degrees(np.array([longitude]), np.array([latitude]), 17, is_south=False)
     assert np.abs(found - [630_084, 4_833_438]).max() < 1
 
 
 def test_utm_of_a_meridian():
     """On its central meridian a zone is 0.9996 times the arc, 4,984,944.378 m to 45 degrees; south begins at 10^7."""
-    found = utm.utm_from_degrees(np.full(2, 9.0), np.array([45.0, -45.0]), 32, is_south=False)
+    found = cameras.utm_from_degrees(np.full(2, 9.0), np.array([45.0, -45.0]), 32, is_south=False)
     arc = 0.9996 * 4_984_944.378
     assert np.abs(found - [[500_000, arc], [500_000, -arc]]).max() < 1e-3
-    south = utm.utm_from_degrees(np.full(1, 9.0), np.array([-45.0]), 32, is_south=True)
+    south = cameras.utm_from_degrees(np.full(1, 9.0), np.array([-45.0]), 32, is_south=True)
     assert south[0, 1] == pytest.approx(1e7 - arc, abs=1e-3)
     with pytest.raises(InputError, match="84 degrees"):
-        utm.utm_from_degrees(np.zeros(1), np.array([85.0]), 31, is_south=False)
+        cameras.utm_from_degrees(np.zeros(1), np.array([85.0]), 31, is_south=False)
 
 
 @pytest.mark.parametrize("latitude", [3.0, 30.0, 61.0, 80.0])
@@ -59,7 +66,7 @@ def test_northings_are_arcs_of_the_meridian(latitude):
     a, f = 6_378_137.0, 1 / 298.257223563
     e2 = f * (2 - f)
     arc = quad(lambda phi: a * (1 - e2) / (1 - e2 * np.sin(phi) ** 2) ** 1.5, 0, np.radians(latitude), epsrel=1e-13)[0]
-    found = utm.utm_from_degrees(np.full(1, 9.0), np.full(1, latitude), 32, is_south=False)
+    found = cameras.utm_from_degrees(np.full(1, 9.0), np.full(1, latitude), 32, is_south=False)
     assert np.abs(found - [500_000, 0.9996 * arc]).max() < 1e-6
 
 
@@ -69,7 +76,7 @@ def test_utm_agrees_with_proj(is_south):
     warp = pytest.importorskip("rasterio.warp")
     rng, code = np.random.default_rng(0), f"EPSG:{32732 if is_south else 32632}"
     longitudes, latitudes = rng.uniform(5.5, 12.5, 1000), rng.uniform(0, 84, 1000) * (-1 if is_south else 1)
-    found = utm.utm_from_degrees(longitudes, latitudes, 32, is_south=is_south)
+    found = cameras.utm_from_degrees(longitudes, latitudes, 32, is_south=is_south)
     assert np.abs(found - np.column_stack(warp.transform("EPSG:4326", code, longitudes, latitudes))).max() < 1e-6
 
 
@@ -82,7 +89,7 @@ def make_rpc(curved=0.0):
     numerators[:, 10:] += curved
     denominators[:, 1:4] += curved
     degrees = 300 / 111_320
-    return rpc.RPC(
+    return cameras.RPC(
         np.array([12.5, 41.9, 50.0]),
         np.array([degrees / np.cos(np.radians(41.9)), degrees, 100.0]),
         np.array([600.0, 600.0]),
@@ -109,7 +116,7 @@ def text_of(r, style="txt"):
         lines = [f"{name}: {float(value)!r} degrees" for name, value in flat.items()]
         lines += [f"{name}_{k}: {float(v)!r}" for name, values in lists.items() for k, v in enumerate(values, 1)]
         return "\n".join(lines)
-    back = {theirs: ours for ours, theirs in rpc._RPB_NAMES.items()}
+    back = {theirs: ours for ours, theirs in cameras._RPB_NAMES.items()}
     lines = [f"  {back[name]} = {float(value)!r};" for name, value in flat.items()]
     for name, values in lists.items():
         rows = ",\n".join(repr(float(v)) for v in values)
@@ -119,16 +126,16 @@ def text_of(r, style="txt"):
 
 def test_monomials_have_the_order_of_rpc00b():
     """Each coefficient alone, at L, P, H = 2, 3, 5, by hand."""
-    m, _ = rpc._monomials(np.array([[2.0, 3.0, 5.0]]))
+    m, _ = cameras._monomials(np.array([[2.0, 3.0, 5.0]]))
     assert m[0].tolist() == [1, 2, 3, 5, 6, 10, 15, 4, 9, 25, 30, 8, 18, 50, 12, 27, 75, 20, 45, 125]
 
 
 def test_derivatives_of_monomials():
     x, h = np.array([[0.3, -0.7, 0.4]]), 1e-6
-    _, dm = rpc._monomials(x)
+    _, dm = cameras._monomials(x)
     for k in range(3):
         step = h * np.eye(3)[k]
-        difference = (rpc._monomials(x + step)[0] - rpc._monomials(x - step)[0]) / (2 * h)
+        difference = (cameras._monomials(x + step)[0] - cameras._monomials(x - step)[0]) / (2 * h)
         assert np.abs(dm[:, k] - difference).max() < FINE
 
 
@@ -136,29 +143,29 @@ def test_projection_by_hand():
     """A scale of latitude north is 600 lines up and 60 samples right; the middle's centre is at 600.5."""
     r = make_rpc()
     ground = np.array([r.ground_offset, r.ground_offset + np.array([0, r.ground_scale[1], 0])])
-    assert np.abs(rpc.project(r, ground) - [[600.5, 600.5], [660.5, 0.5]]).max() < 1e-9
+    assert np.abs(cameras.project(r, ground) - [[600.5, 600.5], [660.5, 0.5]]).max() < 1e-9
 
 
 def test_localisation_inverts_projection():
     r = make_rpc(0.01)
     rng = np.random.default_rng(0)
     pixels, heights = rng.uniform(0, 1200, (50, 2)), rng.uniform(0, 100, 50)
-    ground = rpc.localise(r, pixels, heights)
-    assert np.abs(rpc.project(r, ground) - pixels).max() < 1e-6
+    ground = cameras.localise(r, pixels, heights)
+    assert np.abs(cameras.project(r, ground) - pixels).max() < 1e-6
     assert np.abs(ground[:, 2] - heights).max() < EXACT * 100
 
 
 def test_localisation_refuses_what_has_no_inverse():
     r = make_rpc()
     with pytest.raises(InputError, match="cannot be inverted"):
-        rpc.localise(r._replace(numerators=np.ones((2, 20))), np.array([[3.0, 5.0]]), np.zeros(1))
+        cameras.localise(r._replace(numerators=np.ones((2, 20))), np.array([[3.0, 5.0]]), np.zeros(1))
 
 
 @pytest.mark.parametrize("style", ["txt", "rpb"])
 def test_texts_are_read(tmp_path, style):
     r, image = make_rpc(0.01), tmp_path / "a.png"
     (tmp_path / ("a_RPC.TXT" if style == "txt" else "a.RPB")).write_text(text_of(r, style))
-    found = rpc.read_rpc(image)
+    found = cameras.read_rpc(image)
     assert all(np.array_equal(a, b) for a, b in zip(found, r, strict=True))
 
 
@@ -170,9 +177,9 @@ def test_bad_texts_are_refused(tmp_path):
         (text.replace("LAT_SCALE: ", "LAT_SCALE: 0 # "), "scale of the RPC is 0"),
     ):
         with pytest.raises(InputError, match=message):
-            rpc.parse_rpc(bad, tmp_path / "x_RPC.TXT")
+            cameras.parse_rpc(bad, tmp_path / "x_RPC.TXT")
     with pytest.raises(InputError, match=r"no RPC; put b_RPC\.TXT beside it"):
-        rpc.read_rpc(tmp_path / "b.png")
+        cameras.read_rpc(tmp_path / "b.png")
 
 
 # --- the affine fit ---
@@ -186,7 +193,7 @@ def perspective(distance, gsd=0.3, size=500.0):
         flat = (pixels - n / 2) * gsd * (distance - altitudes)[:, None] / distance
         return np.column_stack([flat * [1, -1], altitudes])
 
-    return partial(affine_fit.fit_affine, world_of, n, n, (-50.0, 50.0), "photo")
+    return partial(cameras.fit_affine, world_of, n, n, (-50.0, 50.0), "photo")
 
 
 def test_residual_of_a_perspective_camera():
@@ -201,26 +208,26 @@ def test_residual_of_a_perspective_camera():
 def test_fit_of_an_rpc():
     """An RPC without curvature is affine in degrees; UTM bends it by 0.03 pixels."""
     r = make_rpc()
-    frame = affine_fit.frame_of([r], (1200, 1200), (0.0, 100.0))
+    frame = cameras.choose_frame([r], (1200, 1200), (0.0, 100.0))
     assert (frame.zone, frame.is_south) == (33, False)
-    fit = affine_fit.fit_rpc(r, frame, (1200, 1200), (0.0, 100.0), "a")
+    fit = cameras.fit_rpc(r, frame, (1200, 1200), (0.0, 100.0), "a")
     assert fit.worst < 0.04
-    ground = rpc.localise(r, np.array([[100.0, 900.0]]), np.array([80.0]))
-    place = utm.utm_from_degrees(ground[:, 0], ground[:, 1], frame.zone, is_south=False)
+    ground = cameras.localise(r, np.array([[100.0, 900.0]]), np.array([80.0]))
+    place = cameras.utm_from_degrees(ground[:, 0], ground[:, 1], frame.zone, is_south=False)
     x = (np.append(place[0], 80.0) - frame.origin) / frame.scale
     assert np.abs(fit.A @ x + fit.b - [100, 900, 80 - frame.origin[2]]).max() < 0.05
     with pytest.raises(InputError, match=r"curved: .* pixels"):
-        affine_fit.fit_rpc(make_rpc(0.01), frame, (1200, 1200), (0.0, 100.0), "curved")
+        cameras.fit_rpc(make_rpc(0.01), frame, (1200, 1200), (0.0, 100.0), "curved")
 
 
 def test_altitudes_have_to_be_a_range():
     with pytest.raises(InputError, match="--altitudes LOW,HIGH"):
-        affine_fit.check_altitudes(None)
+        cameras.check_altitudes(None)
     for bad in ((5.0, 5.0), (3.0, 1.0), (0.0, np.nan)):
         with pytest.raises(InputError, match="no range"):
-            affine_fit.check_altitudes(bad)
+            cameras.check_altitudes(bad)
     with pytest.raises(InputError, match="horizon"):
-        affine_fit.camera_of(np.eye(3), np.zeros(3), 4, 4, np.array([1.0, 0, 0]))
+        cameras.make_affine_camera(np.eye(3), np.zeros(3), 4, 4, np.array([1.0, 0, 0]))
 
 
 # --- light ---
@@ -230,17 +237,17 @@ def test_shadow_by_hand():
     """The sun at 45 degrees in the west: 2 m east of a wall of 2 m the ground is dark as exp(-0.8), 3 m it is lit."""
     of_sun = np.zeros((1, 12))
     of_sun[0, 4] = 2.0  # the roof, where the sun's ray arrives that passes it
-    tape = reference.shadows(np.zeros((1, 4)), of_sun, (-1.0, 0.0), (4, 0))
+    tape = formulas.shadows(np.zeros((1, 4)), of_sun, (-1.0, 0.0), (4, 0))
     assert np.abs(tape.shadows - [[np.exp(-0.8), 1, 1, 1]]).max() < EXACT
     high = np.array([[0.0, 0.0, 2.0, 0.0]])  # pixel 2, 2 m high, is read 2 pixels to the right, at 4 + 2 + 2
     of_sun[0, 8] = 3.0
-    tape = reference.shadows(high, of_sun, (-1.0, 0.0), (4, 0))
+    tape = formulas.shadows(high, of_sun, (-1.0, 0.0), (4, 0))
     assert tape.shadows[0, 2] == pytest.approx(np.exp(-0.4))
 
 
 def test_light_by_hand():
     radiometry = np.column_stack([np.diag([1.0, 2.0, 0.5]), [0.1, 0.0, 0.2]])
-    found = reference.light(np.full((1, 2, 3), 0.4), np.array([[1.0, 0.5]]), radiometry, np.array([0.0, 0.5, 1.0]))
+    found = formulas.light(np.full((1, 2, 3), 0.4), np.array([[1.0, 0.5]]), radiometry, np.array([0.0, 0.5, 1.0]))
     assert np.abs(found[0] - [[0.5, 0.8, 0.4], [0.25, 0.6, 0.4]]).max() < EXACT
 
 
@@ -252,18 +259,18 @@ def test_gradients(name):
     arguments, function, gradient = {
         "altitudes": (
             (h, rng.uniform(0.02, 0.9, (4, 5))),
-            reference.altitudes,
-            lambda v, *a: reference.altitudes_vjp(*a, v),
+            formulas.altitudes,
+            lambda v, *a: formulas.altitudes_vjp(*a, v),
         ),
         "shadows": (
             (h, of_sun),
-            lambda a, b: reference.shadows(a, b, (0.7, -0.4), (2, 2)).shadows,
-            lambda v, a, b: reference.shadows_vjp(reference.shadows(a, b, (0.7, -0.4), (2, 2)), v),
+            lambda a, b: formulas.shadows(a, b, (0.7, -0.4), (2, 2)).shadows,
+            lambda v, a, b: formulas.shadows_vjp(formulas.shadows(a, b, (0.7, -0.4), (2, 2)), v),
         ),
         "light": (
             (rng.uniform(size=(4, 5, 3)), rng.uniform(size=(4, 5)), rng.normal(size=(3, 4)), rng.uniform(size=3)),
-            reference.light,
-            lambda v, *a: reference.light_vjp(*a, v),
+            formulas.light,
+            lambda v, *a: formulas.light_vjp(*a, v),
         ),
     }[name]
     v = rng.normal(size=function(*arguments).shape)
@@ -285,19 +292,19 @@ def test_slopes_at_the_kinks():
     of_sun, d = np.array([[1.0, 3.0, 2.0]]), 1e-6
 
     def shadow(h):  # of a pixel over the sun's middle one
-        return reference.shadows(np.full((1, 1), h), of_sun, (0.0, 0.0), (1, 0))
+        return formulas.shadows(np.full((1, 1), h), of_sun, (0.0, 0.0), (1, 0))
 
     at = shadow(3.0)
     right, left = (shadow(3.0 + d).shadows - at.shadows) / d, (at.shadows - shadow(3.0 - d).shadows) / d
-    assert right[0, 0] == 0 and left[0, 0] == pytest.approx(reference.DARKENING, rel=1e-5)
-    assert [float(v.sum()) for v in reference.shadows_vjp(at, np.ones((1, 1)))] == [0, 0]
+    assert right[0, 0] == 0 and left[0, 0] == pytest.approx(formulas.DARKENING, rel=1e-5)
+    assert [float(v.sum()) for v in formulas.shadows_vjp(at, np.ones((1, 1)))] == [0, 0]
     image, x, y = of_sun[..., None], np.full((1, 1), 1.5), np.full((1, 1), 0.5)
-    read = reference.sample(image, x, y)
-    sides = [(reference.sample(image, x + sign * d, y).values - read.values)[0, 0, 0] / (sign * d) for sign in (1, -1)]
+    read = formulas.sample(image, x, y)
+    sides = [(formulas.sample(image, x + sign * d, y).values - read.values)[0, 0, 0] / (sign * d) for sign in (1, -1)]
     assert sides == pytest.approx([-1.0, 2.0])
-    assert reference.sample_vjp(read, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == pytest.approx(-1.0)
-    edge = reference.sample(image, x + 1, y)  # the last centre: constant beyond it
-    assert reference.sample_vjp(edge, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == 0
+    assert formulas.sample_vjp(read, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == pytest.approx(-1.0)
+    edge = formulas.sample(image, x + 1, y)  # the last centre: constant beyond it
+    assert formulas.sample_vjp(edge, image.shape, np.ones((1, 1, 1)))[1][0, 0, 0] == 0
 
 
 # --- the renderer ---

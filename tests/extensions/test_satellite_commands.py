@@ -13,8 +13,8 @@ from test_satellite import make_rpc, text_of
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.satellite.rpc import read_rpc
-from minisplat_ref.extensions.satellite.training import read_images, read_suns
+from minisplat_ref.extensions.satellite.cameras import read_rpc
+from minisplat_ref.extensions.satellite.commands import read_images, read_suns
 from minisplat_ref.io import save_ply, write_image
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.label import Label

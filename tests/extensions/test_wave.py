@@ -11,18 +11,22 @@ from data_tools.claims.wave.measures import facing, tilted
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.wave import blending, encoding, windows
+from minisplat_ref.extensions.wave import blending
 from minisplat_ref.extensions.wave.blending import Scene, front_to_back
+from minisplat_ref.extensions.wave.focus import decode_phases, encode_phases
+from minisplat_ref.extensions.wave.hologram import place, steepest_slope
 from minisplat_ref.extensions.wave.kernels import sum_spectra
-from minisplat_ref.extensions.wave.placement import place, steepest_slope
-from minisplat_ref.extensions.wave.reference import Flats, spectra, spectrum, waves_of
-from minisplat_ref.extensions.wave.sampling import (
+from minisplat_ref.extensions.wave.model import (
+    Flats,
     Grid,
     check_sampling,
-    field_from,
+    compute_field,
+    compute_spectrum,
     grid_waves,
+    make_waves,
     propagate,
-    spectrum_from,
+    spectra,
+    spectrum,
     transfer,
 )
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -58,7 +62,7 @@ def images_of(flats, grid=GRID):
 def test_a_gaussian_that_faces_the_viewer_by_hand():
     """In its plane the spectrum is that of a 2D Gaussian; a quarter of a wavelength before it the peak turns by i."""
     flats = facing([[2.0, 0.5, 3.0]], [0.7])
-    waves = waves_of(np.array([0.0, 0.25]), np.array([0.0, 0.0]), 1.0)
+    waves = make_waves(np.array([0.0, 0.25]), np.array([0.0, 0.0]), 1.0)
     peak = 2 * np.pi * 0.49
     expected = [peak, peak * np.exp(-2 * np.pi**2 * 0.49 * 0.0625) * np.exp(-2j * np.pi * 0.25 * 2.0)]
     slowed = np.exp(2j * np.pi * 0.25 * np.sqrt(1 - 0.0625))
@@ -70,12 +74,12 @@ def test_in_its_own_plane_it_is_its_image():
     flats = facing([[1.3e-5, -2e-5, 0.4e-3]], [2e-5])
     waves = grid_waves(GRID, LAMBDA)
     G = spectra(flats, waves._replace(k=waves.k.reshape(-1, 3)), 0.4e-3).reshape(waves.k.shape[:2])
-    u = field_from(G, waves, GRID)[: GRID.height, : GRID.width]
+    u = compute_field(G, waves, GRID)[: GRID.height, : GRID.width]
     assert_allclose(np.abs(u), images_of(flats)[0], atol=WAVE_PHASE)
 
 
 def test_evanescent_waves_carry_nothing():
-    waves = waves_of(np.array([0.0, 1.2, 0.8]), np.array([0.0, 0.0, 0.8]), 1.0)
+    waves = make_waves(np.array([0.0, 1.2, 0.8]), np.array([0.0, 0.0, 0.8]), 1.0)
     assert_array_equal(spectra(facing([[0, 0, 0]], [0.1]), waves)[0] != 0, [True, False, False])
 
 
@@ -109,7 +113,7 @@ def test_there_and_back_is_the_field_itself(rng):
     waves = grid_waves(GRID, LAMBDA)
     field = rng.normal(size=(96, 120)) + 1j * rng.normal(size=(96, 120))
     H = transfer(waves, GRID, 1e-4) * transfer(waves, GRID, -1e-4)
-    assert_allclose(field_from(spectrum_from(field, waves, GRID) * H, waves, GRID), field, atol=WAVE_PHASE)
+    assert_allclose(compute_field(compute_spectrum(field, waves, GRID) * H, waves, GRID), field, atol=WAVE_PHASE)
 
 
 def test_light_that_would_cross_the_margin_is_left_out():
@@ -167,8 +171,8 @@ def test_gaussians_side_by_side_have_no_use_for_blending():
 @pytest.mark.parametrize(
     ("way", "in_windows"),
     [
-        (blending.blend, windows.blend_windows),
-        (blending.blend_silhouettes, windows.blend_silhouette_windows),
+        (blending.blend, blending.blend_windows),
+        (blending.blend_silhouettes, blending.blend_silhouette_windows),
     ],
 )
 def test_windows_are_the_same_blending(way, in_windows, rng):
@@ -184,38 +188,38 @@ def test_windows_are_the_same_blending(way, in_windows, rng):
 def test_windows_leave_out_the_ringing_of_narrow_gaussians(pixels, error):
     """As the docstring promises."""
     scene = Scene(facing([[3e-6, 2e-6, 5e-4]], [pixels * 8e-6]), np.ones(1), np.ones((1, 3)))
-    exact, in_window = (way(scene, GRID, LAMBDA, 0) for way in (blending.blend, windows.blend_windows))
+    exact, in_window = (way(scene, GRID, LAMBDA, 0) for way in (blending.blend, blending.blend_windows))
     assert np.abs(exact - in_window).max() < error
 
 
 def test_a_window_may_leave_the_grid():
     beside = facing([[-2.4e-4, 0, 0], [1e-2, 0, 0]], [2e-5, 2e-5])  # half outside; far outside
-    field = windows.blend_windows(Scene(beside, np.ones(2), np.ones((2, 3))), GRID, LAMBDA, 0)
+    field = blending.blend_windows(Scene(beside, np.ones(2), np.ones((2, 3))), GRID, LAMBDA, 0)
     assert_allclose(np.abs(field), images_of(beside)[0], atol=WAVE_WINDOW)
 
 
 def test_planes_are_the_nearest():
-    planes = windows.planes_of(np.array([4.0, 3.4, 3.0, 1.0, 0.0]), 5)
+    planes = blending.make_planes(np.array([4.0, 3.4, 3.0, 1.0, 0.0]), 5)
     assert_array_equal(planes.z, [4, 3, 2, 1, 0])
     assert_array_equal(planes.of, [0, 1, 1, 3, 4])
-    assert_array_equal(windows.planes_of(np.array([1.0, 1.0]), 5).z, [1.0])
+    assert_array_equal(blending.make_planes(np.array([1.0, 1.0]), 5).z, [1.0])
 
 
 # --- focus ---
 
 
 def test_phases_alone_show_amplitudes():
-    phases, peak = encoding.encode(np.array([[1.0, 0.5j], [0.5, 0.0]]))
+    phases, peak = encode_phases(np.array([[1.0, 0.5j], [0.5, 0.0]]))
     third = np.pi / 3
     expected = [[0, np.pi / 2 - third], [2 * np.pi - third, np.pi / 2]]
     assert peak == 1
     assert_allclose(phases, expected, atol=CLOSED_FORM * 10)
     rows = np.linspace(0, np.pi, GRID.height)[:, None]
     field = (0.6 + 0.2 * np.cos(np.linspace(0, 6, GRID.width))) * np.exp(0.7j * np.sin(rows))
-    shown = encoding.decode(*encoding.encode(field), GRID, LAMBDA)
+    shown = decode_phases(*encode_phases(field), GRID, LAMBDA)
     inside = slice(8, -8), slice(8, -8)  # away from the edge of the display, where the amplitude ends
     assert np.abs(shown - field)[inside].max() < WAVE_ENCODING * 2
-    assert np.abs(encoding.encode(np.zeros((2, 2), complex))[0] - np.pi / 2).max() > 1  # black: half a turn apart
+    assert np.abs(encode_phases(np.zeros((2, 2), complex))[0] - np.pi / 2).max() > 1  # black: half a turn apart
 
 
 # --- what aliases ---

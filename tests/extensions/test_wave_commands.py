@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from minisplat_ref.app.cli import main
-from minisplat_ref.extensions.wave import hologram_file
+from minisplat_ref.extensions.wave.focus import load_hologram
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.label import Label
@@ -52,7 +52,7 @@ def line_of(arguments, capsys):
 
 
 def test_a_hologram_has_what_is_needed_to_look_at_it(hologram, run):
-    found = hologram_file.load(hologram)
+    found = load_hologram(hologram)
     assert found.fields.shape == (3, 32, 48) and found.fields.dtype == np.complex128
     assert_allclose([*found.wavelengths, found.pitch, found.thickness], [638e-9, 520e-9, 450e-9, 8e-6, 4e-3])
     near, far = found.depths
@@ -67,7 +67,7 @@ def test_a_hologram_has_what_is_needed_to_look_at_it(hologram, run):
 def test_a_camera_is_chosen_by_its_name(hologram, run, tmp_path):
     out = tmp_path / "beside.npz"
     assert main(["wave", "hologram", str(run), "--camera", "beside", "--out", str(out)]) == 0
-    default, beside = (np.abs(hologram_file.load(path).fields) for path in (hologram, out))
+    default, beside = (np.abs(load_hologram(path).fields) for path in (hologram, out))
     assert np.abs(default - beside).mean() > 0.05
 
 
@@ -75,7 +75,7 @@ def test_with_everything_in_focus_it_is_the_image(run, tmp_path):
     """A box that is thinner than a wavelength: the absolute values are what 3DGS draws, but for what is flat."""
     out, image = tmp_path / "thin.npz", tmp_path / "image.png"
     assert main(["wave", "hologram", str(run), "--thickness", "0.0001", "--out", str(out)]) == 0
-    depth = str(hologram_file.load(out).depths.mean())
+    depth = str(load_hologram(out).depths.mean())
     assert main(["wave", "focus", str(out), "--depth", depth, "--out", str(image)]) == 0
     from minisplat_ref.io.ply import load_ply
 
@@ -85,7 +85,7 @@ def test_with_everything_in_focus_it_is_the_image(run, tmp_path):
 
 
 def test_focus_changes_the_image_and_phases_alone_resemble_it(hologram, tmp_path):
-    near, far = hologram_file.load(hologram).depths
+    near, far = load_hologram(hologram).depths
     images = {}
     for name, depth, *further in (("near", near), ("far", far), ("phase", near, "--phase-only")):
         out = tmp_path / f"{name}.png"
@@ -100,7 +100,7 @@ def test_focus_changes_the_image_and_phases_alone_resemble_it(hologram, tmp_path
 def test_other_blending_resembles_exact_blending(blending, hologram, run, tmp_path):
     out = tmp_path / "other.npz"
     assert main(["wave", "hologram", str(run), "--camera", "test", "--blending", blending, "--out", str(out)]) == 0
-    exact, other = (np.abs(hologram_file.load(path).fields) for path in (hologram, out))
+    exact, other = (np.abs(load_hologram(path).fields) for path in (hologram, out))
     assert 1e-4 < np.sqrt(np.mean((exact - other) ** 2)) < 0.5 * np.sqrt(np.mean(exact**2))
 
 
@@ -123,7 +123,7 @@ def test_a_scene_of_millimetres_gives_the_same_hologram(hologram, run, tmp_path)
     views = [Viewpoint("front", CAMERA, "test")]
     (tmp_path / "cameras.json").write_text(json.dumps(viewpoints.to_json(views)))
     assert main(["wave", "hologram", str(tmp_path), "--out", str(tmp_path / "h.npz")]) == 0
-    large, found = hologram_file.load(hologram), hologram_file.load(tmp_path / "h.npz")
+    large, found = load_hologram(hologram), load_hologram(tmp_path / "h.npz")
     assert_allclose(1024 * found.depths, large.depths, rtol=1e-5)
     assert np.abs(np.abs(found.fields) - np.abs(large.fields)).max() < 1e-3
 

@@ -8,11 +8,10 @@ import numpy as np
 from minisplat_ref.extensions.cuts.curve import evaluate_cuts_vjp
 from minisplat_ref.extensions.cuts.gradient_checks import stages as cuts_stages
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
-from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds
-from minisplat_ref.extensions.mixed.gradient_checks import stages as mixed_stages
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.population import as_ellipses
-from minisplat_ref.extensions.mixed.projection import in_plane_vjp
+from minisplat_ref.extensions.mixed.model import MIXED_GAUSSIANS, mix_kinds
+from minisplat_ref.extensions.mixed.model import stages as mixed_stages
+from minisplat_ref.extensions.mixed.population import make_ellipses
+from minisplat_ref.extensions.mixed.projection import place_vertices_vjp
 from minisplat_ref.extensions.textured.model import add_textures, meet_vjp
 from minisplat_ref.extensions.textured.recipe import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.recipe import stages as textured_stages
@@ -63,7 +62,7 @@ def random_textures(rng, gaussians, degree=3):
 
 
 def triangles_of_one_point(gaussians):
-    return as_ellipses(gaussians)._replace(n_vertices=np.full(len(gaussians.means), 3.0))
+    return make_ellipses(gaussians)._replace(n_vertices=np.full(len(gaussians.means), 3.0))
 
 
 CASES = {
@@ -78,11 +77,11 @@ CASES = {
     ),
     "mixed": Case(
         MIXED_GAUSSIANS,
-        lambda rng, gaussians: of_all_kinds(gaussians, rng),
-        as_ellipses,
+        lambda rng, gaussians: mix_kinds(gaussians, rng),
+        make_ellipses,
         triangles_of_one_point,
         mixed_stages,
-        ("minisplat_ref.extensions.mixed.projection.in_plane_vjp", in_plane_vjp),
+        ("minisplat_ref.extensions.mixed.projection.place_vertices_vjp", place_vertices_vjp),
         frozenset({"n_vertices"}),
         has_own_depths=True,
     ),

@@ -10,8 +10,8 @@ places as small ellipses, lines or triangles, and are trained by 3DGS's rates; t
 
 import numpy as np
 
-from minisplat_ref.extensions.mixed.method import MIXED, MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
+from minisplat_ref.extensions.mixed.model import MIXED, MIXED_GAUSSIANS
+from minisplat_ref.extensions.mixed.population import MixedGaussians, make_ellipses
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import zero_moments
@@ -54,7 +54,7 @@ def place_in_plane(places: Floats, vertices: Floats, n_vertices: int, thickness:
         sh_dc=np.ones((n, 3), np.float32),
         sh_rest=np.zeros((n, 0, 3), np.float32),
     )
-    ellipses = as_ellipses(gaussians)
+    ellipses = make_ellipses(gaussians)
     kinds = np.full(n, n_vertices, np.float32)
     return ellipses._replace(vertices=(scale * vertices).astype(np.float32), n_vertices=kinds)
 

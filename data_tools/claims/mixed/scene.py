@@ -17,8 +17,8 @@ from data_tools.claims.kit.figures import group, plot_curves, subplots
 from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import SCENE_NAMES
-from minisplat_ref.extensions.mixed.method import MIXED as RECIPE
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simplify_hulls
+from minisplat_ref.extensions.mixed.model import MIXED as RECIPE
+from minisplat_ref.extensions.mixed.model import MIXED_GAUSSIANS, promote, simplify_hulls
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import describe_machine

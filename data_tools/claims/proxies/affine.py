@@ -22,9 +22,9 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import set_ticks, show, subplots, table_of
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, rotation_about
 from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
+from minisplat_ref.extensions.proxies.edit import Affine, are_in_ball, edit_gaussians, make_affine, make_rotation
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform, polar_rotations
@@ -36,9 +36,9 @@ from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 MAPS = {
-    "rotation": rotation_about((20.0, -50.0, 70.0)),
-    "rotation and scale": 1.7 * rotation_about((20.0, -50.0, 70.0)),
-    "reflection": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5.0, 6.0, 7.0)),
+    "rotation": make_rotation((20.0, -50.0, 70.0)),
+    "rotation and scale": 1.7 * make_rotation((20.0, -50.0, 70.0)),
+    "reflection": np.diag([1.0, -1.0, 1.0]) @ make_rotation((5.0, 6.0, 7.0)),
     "stretch": np.diag([0.3, 1.0, 4.0]),
     "shear": np.array([[1.0, 0.8, -0.3], [0.0, 1.0, 0.5], [0.2, 0.0, 1.0]]),
 }
@@ -219,10 +219,10 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
     """Draw a sheet, an edit of its middle, the rolled sheet, and the errors of rolling."""
     figure, panels = subplots((9.0, 2.6), 1, 4, gridspec_kw={"width_ratios": [1, 1, 1, 1.5]})
     sheet, centre = flat_gaussians(np.random.default_rng(seed)), np.zeros(3)
-    raised = about_point(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
+    raised = make_affine(make_rotation((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
     images = {
         "a sheet": sheet,
-        "its middle rotated\nby 45° and raised": edit_gaussians(sheet, raised, in_ball(sheet.means, centre, 0.6)),
+        "its middle rotated\nby 45° and raised": edit_gaussians(sheet, raised, are_in_ball(sheet.means, centre, 0.6)),
         f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bend_by(CELLS[3], sheet, True),
     }
     for axes, (title, gaussians) in zip(panels, images.items(), strict=False):
@@ -242,5 +242,5 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
 
 def _before_the_camera(sheet: Gaussians) -> Gaussians:
     """Return the sheet tilted and moved so that the camera sees it obliquely from above."""
-    tilted = Affine(rotation_about((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
+    tilted = Affine(make_rotation((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
     return edit_gaussians(sheet, tilted, np.ones(len(sheet.means), bool))

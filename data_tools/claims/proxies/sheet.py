@@ -26,9 +26,18 @@ from data_tools.claims.kit.figures import set_ticks, show, table_of
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
-from minisplat_ref.extensions.proxies.mass_spring import Energies, Sheet, State, energies, integrate, longest_step
-from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
+from minisplat_ref.extensions.proxies.fall import Setting, make_sheet
+from minisplat_ref.extensions.proxies.mass_spring import (
+    Energies,
+    Sheet,
+    State,
+    choose_stiffness,
+    energies,
+    integrate,
+    longest_step,
+    make_springs,
+    vertex_masses,
+)
 from minisplat_ref.interface.palette import BLUE, GREEN, RED
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
@@ -66,7 +75,7 @@ def level_sheet(n_cells: int) -> Mesh:
 def free_fall(seed: int) -> dict[str, float]:
     """Return the largest errors of Gaussians on a sheet that is thrown up and falls freely for one second."""
     gaussians, mesh = carpet(seed), level_sheet(8)
-    sheet = sheet_of(mesh, Setting(GRAVITY, np.zeros(len(mesh.vertices), bool), 0.01, 0.0, None))
+    sheet = make_sheet(mesh, Setting(GRAVITY, np.zeros(len(mesh.vertices), bool), 0.01, 0.0, None))
     n_steps = int(np.ceil(1 / (0.2 * longest_step(sheet))))
     velocity = np.array([0.3, -2.0, 0.1])
     state = State(mesh.vertices, np.broadcast_to(velocity, mesh.vertices.shape))
@@ -99,9 +108,9 @@ def hang_sheet(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
     r = LENGTH / 2 / half_angle  # it starts as a circular arc, which is neither stretched nor at rest
     start = np.column_stack([r * np.sin(s / r), r * np.cos(s / r) - r * np.cos(half_angle), rest.vertices[:, 2]])
     masses = vertex_masses(rest, 1.0)
-    stiffness = stiffness_for_stretch(rest, float(masses.sum()) * G, stretch)._replace(bend=0.0)
+    stiffness = choose_stiffness(rest, float(masses.sum()) * G, stretch)._replace(bend=0.0)
     is_pinned = np.abs(np.abs(s) - LENGTH / 2) < 1e-9
-    sheet = Sheet(masses, springs_of(rest, stiffness), is_pinned, GRAVITY, SETTLING_DRAG)
+    sheet = Sheet(masses, make_springs(rest, stiffness), is_pinned, GRAVITY, SETTLING_DRAG)
     step = SETTLING_STEP * longest_step(sheet)
     end = integrate(State(start, np.zeros_like(start)), sheet, step, int(SETTLING / step))
     return end.positions[:, :2], catenary(s)
@@ -111,7 +120,7 @@ def swing_sheet(swing: Swing, fraction: float) -> list[Energies]:
     """Return the energies over time of a sheet held at one side; a step is ``fraction`` of the longest stable one."""
     mesh = level_sheet(SWING_CELLS)
     is_pinned = mesh.vertices[:, 0] < -0.5 + 1e-9
-    sheet = sheet_of(mesh, Setting(GRAVITY, is_pinned, 0.01, swing.drag, swing.drop))
+    sheet = make_sheet(mesh, Setting(GRAVITY, is_pinned, 0.01, swing.drag, swing.drop))
     n_steps = int(np.ceil(SWING_TIME / SAMPLES / (fraction * longest_step(sheet))))
     state = State(mesh.vertices, np.zeros_like(mesh.vertices))
     found = [energies(state, sheet)]
@@ -190,7 +199,7 @@ def render_swing(seed: int) -> list[Floats]:
     """Return images [SIZE, SIZE, 3] of a carpet that is held at two corners and swings down."""
     gaussians, mesh = carpet(seed), level_sheet(20)
     is_pinned = np.isclose(mesh.vertices[:, 0], -0.5) & np.isclose(np.abs(mesh.vertices[:, 2]), 0.5)
-    sheet = sheet_of(mesh, Setting(GRAVITY, is_pinned, 0.05, 1.0, None))
+    sheet = make_sheet(mesh, Setting(GRAVITY, is_pinned, 0.05, 1.0, None))
     step = 0.3 * longest_step(sheet)
     binding, state, time, images = bind(gaussians, mesh), State(mesh.vertices, np.zeros_like(mesh.vertices)), 0.0, []
     angle = 0.45  # of the camera, which looks down

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.satellite.affine_fit import camera_of
+from minisplat_ref.extensions.satellite.cameras import make_affine_camera
 from minisplat_ref.types import Bools, Camera, Floats, Frame, Scene, View
 
 SCALE, SIZE, N_VIEWS = 48.0, 96, 6  # metres per unit, pixels, photographs
@@ -49,7 +49,7 @@ def _camera(tilt: Floats, size: int, width: float, sun: Floats | None) -> Camera
     A = SCALE * np.array(
         [[per_metre, 0, -per_metre * tilt[0]], [0, -per_metre, per_metre * tilt[1]], [0, 0, 1.0]]
     )  # fmt: skip
-    return camera_of(A, np.array([size / 2, size / 2, 0]), size, size, sun)
+    return make_affine_camera(A, np.array([size / 2, size / 2, 0]), size, size, sun)
 
 
 def make_boxes(rng: np.random.Generator) -> Boxes:

@@ -11,9 +11,9 @@ from data_tools.claims.kit.figures import group, show, subplots, with_deviation
 from data_tools.claims.kit.tables import spread, table
 from data_tools.claims.satellite.boxes import HIGH, SCALE, SIZE, Truth, make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite.affine_fit import fit_residual
-from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
-from minisplat_ref.extensions.satellite.surface_model import surface_model
+from minisplat_ref.extensions.satellite.cameras import fit_residual
+from minisplat_ref.extensions.satellite.commands import surface_model
+from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.loop import train

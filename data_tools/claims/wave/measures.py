@@ -22,12 +22,19 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import show, subplots, table_of
-from minisplat_ref.extensions.wave import blending, windows
+from data_tools.claims.kit.figures import show, table_of
+from minisplat_ref.extensions.wave import blending
 from minisplat_ref.extensions.wave.blending import Scene, front_to_back
-from minisplat_ref.extensions.wave.hologram import blend_fast
-from minisplat_ref.extensions.wave.reference import Complexes, Flats, rayleigh_sommerfeld, spectra
-from minisplat_ref.extensions.wave.sampling import Grid, field_from, grid_waves, propagate
+from minisplat_ref.extensions.wave.model import (
+    Complexes,
+    Flats,
+    Grid,
+    compute_field,
+    grid_waves,
+    propagate,
+    rayleigh_sommerfeld,
+    spectra,
+)
 from minisplat_ref.interface.palette import BLUE, GREEN, OCHRE, RED
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -65,7 +72,7 @@ def closed_form_errors(degrees: float) -> dict[str, float]:
     flats = tilted(degrees, np.array([3e-6, -2e-6, -DISTANCE]), np.array([4e-6, 6e-6]))
     waves = grid_waves(FINE, GREEN_LIGHT)
     listed = waves._replace(k=waves.k.reshape(-1, 3))
-    field = field_from(spectra(flats, listed).reshape(waves.k.shape[:2]), waves, FINE)[: FINE.height, : FINE.width]
+    field = compute_field(spectra(flats, listed).reshape(waves.k.shape[:2]), waves, FINE)[: FINE.height, : FINE.width]
     rows, columns = PLACES.T
     places = np.column_stack([FINE.x[columns], FINE.y[rows], np.zeros(len(PLACES))])
     truth = rayleigh_sommerfeld(flats, places, GREEN_LIGHT)
@@ -151,14 +158,14 @@ def costs(n: int, rng: np.random.Generator) -> dict[str, dict[str, float]]:
     scene = front_to_back(Scene(flats, rng.uniform(0.3, 1, n), rng.uniform(size=(n, 3))))
     n_padded, n_pixels = 4 * USUAL.width * USUAL.height, USUAL.width * USUAL.height
     sizes = [
-        window.width * window.height for i in range(n) for window in [windows.window_of(scene.flats.one(i), USUAL)]
+        window.width * window.height for i in range(n) for window in [blending.choose_window(scene.flats.one(i), USUAL)]
     ]
     n_points = float(np.mean(np.prod(6 * scene.flats.scales / USUAL.pitch, axis=1)))  # three deviations to each side
     ways: dict[str, tuple[Callable[..., Any], float]] = {
         "exact, whole grid": (blending.blend, n_padded),
         "silhouette, whole grid": (blending.blend_silhouettes, n_padded),
-        "fast, kernel": (blend_fast, n_padded),
-        "exact, windows": (windows.blend_windows, float(np.mean(sizes))),
+        "fast, kernel": (blending.blend_by_kernel, n_padded),
+        "exact, windows": (blending.blend_windows, float(np.mean(sizes))),
     }
     found = {}
     for name, (way, evaluations) in ways.items():

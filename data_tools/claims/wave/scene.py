@@ -18,11 +18,9 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import show, subplots, table_of
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.wave.focus import reconstruct
-from minisplat_ref.extensions.wave.hologram import BLENDING, PITCH, THICKNESS, WAVELENGTHS
-from minisplat_ref.extensions.wave.hologram_file import Hologram
-from minisplat_ref.extensions.wave.placement import place, steepest_slope
-from minisplat_ref.extensions.wave.sampling import Grid
+from minisplat_ref.extensions.wave.focus import Hologram, reconstruct
+from minisplat_ref.extensions.wave.hologram import BLENDING, PITCH, THICKNESS, WAVELENGTHS, place, steepest_slope
+from minisplat_ref.extensions.wave.model import Grid
 from minisplat_ref.interface.palette import BLUE, GREEN, RED
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io.ply import read_label

@@ -1,19 +1,18 @@
 """Mixed: ellipses, lines and triangles by one formula, the distance to a hull.
 
 This follows MP-GS, arXiv 2507.11321. A Gaussian is an ellipse in the image. A line has two vertices with one
-covariance, a triangle three; one formula renders them all (:mod:`minisplat_ref.extensions.mixed.response`):
+covariance, a triangle three; one formula renders them all (:mod:`.response`):
 
     alpha = o exp(-dist(y, conv{y_1 .. y_m})^2 / 2),   y = L^-1 x,  L L^T = Sigma_2
 
-The paper puts it together from ellipses around the vertices, their common tangents and quadrilaterals between them;
-the level sets are the same. With one vertex it is 3DGS. Vertices lie in the plane of a Gaussian's first two axes
-(:mod:`minisplat_ref.extensions.mixed.projection`), and are two further numbers each. A training begins with groups of
-near points of like colour (:mod:`minisplat_ref.extensions.mixed.population`); during it, hulls lose vertices that make
-no difference, and needles and discs get some (:mod:`minisplat_ref.extensions.mixed.kinds`).
+The paper puts it together from ellipses around the vertices, their common tangents and quadrilaterals between them; the
+level sets are the same. With one vertex it is 3DGS. Vertices lie in the plane of a Gaussian's first two axes
+(:mod:`.projection`), and are two further numbers each. A training begins with groups of near points of like colour;
+during it, hulls lose vertices that make no difference, and needles and discs get some (:mod:`.population`).
 
 It reconstructs surfaces, so the recipe has the losses of 2D Gaussian Splatting at that paper's weights and dates
 (:mod:`minisplat_ref.mechanisms.surfels.losses`). A pixel's depth and normal come from the primitive's plane
-(:mod:`minisplat_ref.extensions.mixed.planes`), and ``mesh`` fuses the depths of all views:
+(:mod:`.projection`), and ``mesh`` fuses the depths of all views:
 
     normal_consistency   0.05, from iteration 7,000: planes face as the surface through the depths does
     distortion           0, from 3,000: the hits of a ray lie at one depth
@@ -42,13 +41,12 @@ vertices, as in the paper, and size limits consider deviations alone.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds, stages
-from minisplat_ref.extensions.mixed.method import MIXED, MIXED_GAUSSIANS
+from minisplat_ref.extensions.mixed.model import MIXED, MIXED_GAUSSIANS, mix_kinds, stages
 
 EXTENSION = Extension(
     "mixed",
     recipes=(MIXED,),
     representation=MIXED_GAUSSIANS,
     stages=stages,
-    sample=of_all_kinds,
+    sample=mix_kinds,
 )

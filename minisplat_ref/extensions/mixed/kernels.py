@@ -4,7 +4,7 @@ A record begins with the conic's, whose factors whiten: ``e = dx + slope dy`` an
 whitened coordinates. It continues with the vertices from the centre, and for each edge u with ``g = Q u / (u . Q u)``,
 so that the nearest point of a line through o along u is found by one product, ``f = -(o . g)``.
 
-Surfaces have the same records with their planes in them, and :mod:`.surfaces`' depth at every pixel.
+Surfaces have the same records with their planes in them, and the depth of :mod:`.response` at every pixel.
 """
 
 import functools
@@ -24,8 +24,7 @@ from minisplat_ref.cpu.compositing.responses import (
     KernelResponse,
     conic_response,
 )
-from minisplat_ref.extensions.mixed.response import FLAT, HullFootprints
-from minisplat_ref.extensions.mixed.surfaces import RATIO_MIN, SurfaceFootprints
+from minisplat_ref.extensions.mixed.response import FLAT, RATIO_MIN, HullFootprints, SurfaceFootprints
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, load, maximum, minimum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
@@ -49,17 +48,17 @@ _RATIO_MIN = np.float32(RATIO_MIN)
 
 @functools.cache
 def hull_response(exp: Callable) -> KernelResponse:
-    """Response of hulls, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
+    """Return the response of hulls, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
     conic = conic_response(exp)
 
     @scalar
     def from_pixel(records, n, d_x, d_y, vertex):
-        """A vertex from the pixel from which the centre is at d."""
+        """Return a vertex from the pixel from which the centre is at d."""
         return d_x + records[n, vertex], d_y + records[n, vertex + 1]
 
     @scalar
     def on_edge(records, n, o, end, g):
-        """The nearest point of an edge between two vertices: offset from the pixel, sigma, and where it lies on it."""
+        """Return the nearest point of an edge from its pixel, sigma there, and the fraction of the edge before it."""
         u = end[0] - o[0], end[1] - o[1]
         f = minimum(maximum(-(o[0] * records[n, g] + o[1] * records[n, g + 1]), ZERO), ONE)
         d_x, d_y = o[0] + f * u[0], o[1] + f * u[1]
@@ -68,7 +67,7 @@ def hull_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def on_triangle(records, n, d_x, d_y):
-        """The nearest point of a triangle: offset from the pixel, sigma, and the weights of the vertices."""
+        """Return the nearest point of a triangle from its pixel, sigma there, and the weights of the vertices."""
         nothing = broadcast(records.dtype.type(0))
         o_1 = from_pixel(records, n, d_x, d_y, V_1)
         o_2 = from_pixel(records, n, d_x, d_y, V_2)
@@ -144,7 +143,7 @@ def hull_response(exp: Callable) -> KernelResponse:
 
 @functools.cache
 def _surface_response(exp: Callable, layout: tuple[int, int]) -> KernelResponse:
-    """Response of hulls with a depth at every pixel."""
+    """Return the response of hulls with a depth at every pixel."""
     hull = hull_response(exp)
     hull_hit, hull_hit_vjp = hull.hit, hull.hit_vjp
 
@@ -159,7 +158,7 @@ def _surface_response(exp: Callable, layout: tuple[int, int]) -> KernelResponse:
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
-        """With ``q = 1 / z = w r``: ``v_q = -z^2 v_z``; see :func:`.surfaces.hit_vjp`."""
+        """With ``q = 1 / z = w r``: ``v_q = -z^2 v_z``; see :func:`.response.hit_surface_vjp`."""
         depth, d_x, d_y, r, on_hull, _ = place
         v = hull_hit_vjp(records, n, on_hull, v_mean, v_shape, v_place)
         v_q = -depth * depth * load(v_place, 0)
@@ -187,16 +186,16 @@ def _surface_response(exp: Callable, layout: tuple[int, int]) -> KernelResponse:
 
 @scalar
 def side(a, b):
-    """On which side of the edge from a to b the origin lies: the cross product of both."""
+    """Return the cross product of a and b: its sign is the side of the edge from a to b on which the origin lies."""
     return a[0] * b[1] - a[1] * b[0]
 
 
-def response_for(dtype: np.dtype) -> KernelResponse:
+def make_response(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     return hull_response(choose_exponential(dtype))
 
 
-def surface_response_for(layout: Layout, dtype: np.dtype) -> KernelResponse:
+def make_surface_response(layout: Layout, dtype: np.dtype) -> KernelResponse:
     """Return the response of surfaces with the channels of a layout."""
     return _surface_response(choose_exponential(dtype), channels_of(layout))
 

@@ -1,4 +1,4 @@
-"""The response of the hull of one, two or three points in a pixel, in NumPy (MP-GS, 2507.11321).
+"""The response of the hull of one, two or three points in a pixel, in NumPy (MP-GS, 2507.11321), and its depth there.
 
 An ellipse, a Gaussian line and a Gaussian triangle are one formula. Their vertices p_1 .. p_m share the covariance
 ``Q^-1 = L L^T``, and in whitened pixels ``y = L^-1 p`` opacity falls with the distance to the vertices' convex hull::
@@ -16,6 +16,13 @@ ones (the envelope theorem). Its gradient is that of an ellipse around the neare
     d = sum_k w_k p_k - x,   alpha = o exp(-d^T Q d / 2),   v_p_k = w_k v_d
 
 Vertices are given from the hull's centre, which moves them all.
+
+With the plane of a primitive (:mod:`.projection`) a pixel has a depth, too; p is the projected mean::
+
+    1 / z = w max(r, 1/8),   r = 1 + s . (x - p)
+
+The bound keeps depths positive: at most eight times that of the mean, which only a primitive reaches that is about as
+long as it is far away.
 """
 
 from dataclasses import dataclass
@@ -24,12 +31,14 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
+from minisplat_ref.mechanisms.surfels.response import Layout, depth_shading
 from minisplat_ref.reference.hits import CONIC, Hit, Response, conic_matrices
 from minisplat_ref.types import Bools, Floats, Ints
 
 EDGES = ((0, 1), (1, 2), (2, 0))
 INSIDE = -1  # in Nearest.edges
 FLAT = 1e-5  # twice a triangle's area over its longest edge squared: below, it is its edges
+RATIO_MIN = 0.125  # of inverse depths, a pixel's over the mean's; exact in float32
 
 
 @dataclass(frozen=True)
@@ -89,12 +98,12 @@ def nearest(vertices: Floats, n_vertices: Ints, Q: Floats, centers: Floats) -> N
         weights = np.where(is_nearer[:, :, None], of_edge, weights)
         offsets = np.where(is_nearer[:, :, None], d, offsets)
         edges, least = np.where(is_nearer, edge, edges), np.where(is_nearer, squared, least)
-    inside = _inside(vertices, from_pixels) & (n_vertices == 3)[:, None]
+    inside = _are_inside(vertices, from_pixels) & (n_vertices == 3)[:, None]
     outside = np.logical_not(inside)[:, :, None]
     return Nearest(weights * outside, offsets * outside, np.where(inside, INSIDE, edges))
 
 
-def _inside(vertices: Floats, from_pixels: Floats) -> Bools:
+def _are_inside(vertices: Floats, from_pixels: Floats) -> Bools:
     """Return whether the edges of triangles go round the pixels in one direction, [G, P].
 
     Of a flat triangle the signs would be those of rounding errors, on its line as far away as one likes.
@@ -119,7 +128,7 @@ class Place(NamedTuple):
     falloffs: Floats  # [G, P] exp(-sigma)
 
 
-def hit(footprints: HullFootprints, ids: Ints, centers: Floats) -> Hit:
+def hit_hull(footprints: HullFootprints, ids: Ints, centers: Floats) -> Hit:
     """Evaluate hulls at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     projection, Q = footprints.projection, conic_matrices(footprints.conics[ids])
     vertices = footprints.means2d[ids, None] + footprints.vertices[ids]
@@ -132,10 +141,10 @@ def hit(footprints: HullFootprints, ids: Ints, centers: Floats) -> Hit:
     return Hit(unclamped, depths, Place(found, falloffs))
 
 
-def hit_vjp(
+def hit_hull_vjp(
     footprints: HullFootprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
 ) -> tuple[Floats, ...]:
-    """Gradient of :func:`hit` with respect to ``FIELDS``, summed over the pixels.
+    """Gradient of :func:`hit_hull` with respect to ``FIELDS``, summed over the pixels.
 
     With ``alpha = o E``, ``E = exp(-sigma)``, ``sigma = d^T Q d / 2``::
 
@@ -153,4 +162,65 @@ def hit_vjp(
     return v_d.sum(axis=1), v_conics, np.sum(falloffs * v_shape, axis=1), v_vertices
 
 
-RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS)
+RESPONSE = Response(boxes_of, hit_hull, hit_hull_vjp, FIELDS)
+
+
+@dataclass(frozen=True)
+class SurfaceFootprints(HullFootprints):
+    """Hulls as a camera sees them, with their planes."""
+
+    planes: Floats
+    """[N, 3] w and s."""
+    normals: Floats
+    """[N, 3] unit, camera frame, towards the camera."""
+    pivot: float
+    """q_0, an inverse depth of the view; see :class:`minisplat_ref.mechanisms.surfels.response.Layout`."""
+
+
+SURFACE_FIELDS = (*FIELDS, "planes")
+
+
+class SurfacePlace(NamedTuple):
+    """The positions of pixels on surfaces."""
+
+    hull: Hit
+    offsets: Floats  # [G, P, 2] p - x, px
+    ratios: Floats  # [G, P] max(r, 1/8)
+    is_bounded: Bools  # [G, P] r < 1/8
+    depths: Floats  # [G, P] z
+    pivot: float  # q_0
+
+
+def hit_surface(footprints: SurfaceFootprints, ids: Ints, centers: Floats) -> Hit:
+    """Evaluate surfaces at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
+    hull, planes = hit_hull(footprints, ids, centers), footprints.planes[ids]
+    offsets = footprints.means2d[ids, None] - centers.astype(footprints.means2d.dtype)
+    r = 1 - np.einsum("gi,gpi->gp", planes[:, 1:], offsets)
+    ratios = np.maximum(r, RATIO_MIN)
+    depths = 1 / (planes[:, :1] * ratios)
+    place = SurfacePlace(hull, offsets, ratios, r < RATIO_MIN, depths, footprints.pivot)
+    return Hit(hull.unclamped, depths, place)
+
+
+def hit_surface_vjp(
+    footprints: SurfaceFootprints, ids: Ints, found: Hit, v_mean: Floats, v_shape: Floats, v_depths: Floats
+) -> tuple[Floats, ...]:
+    """Gradient of :func:`hit_surface` with respect to ``SURFACE_FIELDS``, summed over the pixels.
+
+    With ``q = 1 / z = w r``, besides the gradient of alpha::
+
+        v_q = -z^2 v_z,   v_w = r v_q,   v_r = w v_q where r is not bounded,   v_s = v_r (x - p),   v_p = -v_r s
+    """
+    place: SurfacePlace = found.place
+    v_p, v_conics, v_opacities, v_vertices = hit_hull_vjp(footprints, ids, place.hull, v_mean, v_shape, None)
+    w, s = footprints.planes[ids, :1], footprints.planes[ids, 1:]
+    v_q = -place.depths * place.depths * v_depths
+    v_r = np.where(place.is_bounded, 0, w * v_q)
+    v_s = -np.einsum("gp,gpi->gi", v_r, place.offsets)
+    v_planes = np.column_stack([np.sum(place.ratios * v_q, axis=1), v_s])
+    return v_p - s * v_r.sum(axis=1, keepdims=True), v_conics, v_opacities, v_vertices, v_planes
+
+
+def surface_response(layout: Layout) -> Response:
+    """Return the response of surfaces with the channels of a layout."""
+    return Response(boxes_of, hit_surface, hit_surface_vjp, SURFACE_FIELDS, depth_shading(layout))

@@ -224,7 +224,7 @@ def with_negatives(gaussians: Gaussians, rng: np.random.Generator, *, fraction: 
     gaussians : Gaussians
         N Gaussians; they are not changed.
     rng : numpy.random.Generator
-        Draws the rows, without replacement.
+        Chooses the rows, without replacement.
     fraction : float
         In [0, 1]; the number of rows is rounded.
     """

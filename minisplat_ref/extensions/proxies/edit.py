@@ -1,27 +1,33 @@
-"""The command ``minisplat-ref proxies edit``, which scales, rotates and moves a part of a scene."""
+"""Affine edits of a part of a scene, and the command ``minisplat-ref proxies edit``.
+
+The map x -> A x + b applies to the Gaussians that a box, a ball or a mesh selects. A Gaussian under an affine map is a
+Gaussian, so nothing is approximated in its shape:
+
+    mu' = A mu + b,   Sigma' = A Sigma A^T
+
+(``mechanisms.editing.deformation`` has the factorisation of the covariance into a quaternion and scales, and the
+rotation of colours). A Gaussian belongs to a selection if its centre does; one that straddles the border is not cut.
+"""
 
 import argparse
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.proxies.affine import (
-    Affine,
-    about_point,
-    check_selected,
-    edit_gaussians,
-    in_ball,
-    in_box,
-    rotation_about,
-)
-from minisplat_ref.extensions.proxies.nearest import nearest_triangles
+from minisplat_ref.extensions.proxies.binding import nearest_triangles
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.mechanisms.editing.model_file import load_label, load_model
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
-from minisplat_ref.types import Bools, Floats
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.types import Bools, Floats, Gaussians
+
+STRETCH_MIN = 1e-9  # smallest singular value of A over its largest; below this, Gaussians would be numerically flat
 
 DESCRIPTION = """\
 Apply x -> A x + b to a part of a scene: scale, then rotate, about a fixed
@@ -35,6 +41,116 @@ examples:
       --rotate 0 30 0 --translate 0 -0.2 0
   minisplat-ref proxies edit runs/fox out.ply --near head.ply --within 0.1 \\
       --matrix 1 0.3 0 0 1 0 0 0 1"""
+
+
+class Affine(NamedTuple):
+    """The map x -> A x + b."""
+
+    A: Floats
+    """[3, 3] float64."""
+    b: Floats
+    """[3] float64, world units."""
+
+
+def make_affine(linear: Floats, pivot: Floats, translation: Floats) -> Affine:
+    """Return the map that applies A about a fixed point p, then translates: ``x -> p + A (x - p) + t``.
+
+    Parameters
+    ----------
+    linear : ndarray of shape (3, 3)
+        A.
+    pivot : ndarray of shape (3,)
+        p, world frame.
+    translation : ndarray of shape (3,)
+        t, world units.
+    """
+    A = np.asarray(linear, np.float64)
+    return Affine(A, (pivot - A @ pivot) + translation)
+
+
+def make_rotation(axis_angle: Sequence[float]) -> Floats:
+    """Return the matrix of a rotation vector: its direction is the axis, its length the angle, in degrees.
+
+    Parameters
+    ----------
+    axis_angle : sequence of 3 floats
+        Right-handed; zeros give the identity exactly.
+    """
+    degrees = np.asarray(axis_angle, np.float64)
+    angle = math.radians(float(np.linalg.norm(degrees)))
+    axis = degrees / max(float(np.linalg.norm(degrees)), np.finfo(np.float64).tiny)
+    return rotation_matrices(np.array([[math.cos(angle / 2), *(math.sin(angle / 2) * axis)]]))[0]
+
+
+def are_in_box(means: Floats, low: Floats, high: Floats) -> Bools:
+    """Return which centres [N, 3] lie in an axis-aligned box, its faces included: [N] booleans."""
+    is_inside: Bools = np.all((means >= low) & (means <= high), axis=1)
+    return is_inside
+
+
+def are_in_ball(means: Floats, centre: Floats, radius: float) -> Bools:
+    """Return which centres [N, 3] lie in a ball, its surface included: [N] booleans."""
+    return np.linalg.norm(means - centre, axis=1) <= radius
+
+
+def edit_gaussians(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussians:
+    """Return the Gaussians with x -> A x + b applied to a selection.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        The Gaussians before the edit.
+    affine : Affine
+        The map; a reflection, with det A < 0, is allowed.
+    is_selected : ndarray of shape (N,) of booleans
+        The others keep their bytes. Under the identity all keep them; under a translation all fields but the means do.
+
+    Returns
+    -------
+    Gaussians
+        In the dtype of ``gaussians``.
+
+    Raises
+    ------
+    InputError
+        A or b is not finite, or A is singular, so that it would flatten Gaussians.
+    """
+    A, b = affine
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+        raise InputError("the map A x + b is not finite; give finite numbers")
+    stretches = np.linalg.svd(A, compute_uv=False)  # descending
+    if not stretches[2] > STRETCH_MIN * stretches[0]:
+        raise InputError(
+            f"A stretches by {stretches[0]:g}, {stretches[1]:g} and {stretches[2]:g}, which flattens Gaussians;"
+            " scale by numbers that are not 0"
+        )
+    maps = Deformation(np.stack([np.eye(3), A]), is_selected.astype(np.int64))
+    means = gaussians.means.astype(np.float64)
+    is_identity = np.array_equal(A, np.eye(3)) and not b.any()
+    moved = means if is_identity else np.where(is_selected[:, None], means @ A.T + b, means)
+    return deform(gaussians, moved, maps)
+
+
+def check_selected(is_selected: Bools, source: str | Path) -> None:
+    """Refuse an empty selection.
+
+    Parameters
+    ----------
+    is_selected : ndarray of shape (N,) of booleans
+        The selection.
+    source : str or Path
+        The model's file, for the message.
+
+    Raises
+    ------
+    InputError
+        Nothing is selected; the line names the model.
+    """
+    if not is_selected.any():
+        raise InputError(
+            f"{source}: none of its {len(is_selected):,} Gaussians is selected; minisplat-ref info shows where they"
+            " are: give a larger --box, --sphere or --within"
+        )
 
 
 def add_parser(commands: Any) -> None:
@@ -69,20 +185,20 @@ def _add(group: Any, name: str, n: int, metavar: str, text: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, edit, write."""
-    linear = _linear(args)
+    """Read the Gaussians, edit the selected ones, and write all."""
+    linear = _read_matrix(args)
     gaussians = load_model(args.model)
     means = gaussians.means.astype(np.float64)
     is_selected = _select(args, means)
     check_selected(is_selected, args.model)
     pivot = means[is_selected].mean(axis=0) if args.about is None else np.array(args.about)
-    affine: Affine = about_point(linear, pivot, np.array(args.translate or (0.0, 0.0, 0.0)))
+    affine: Affine = make_affine(linear, pivot, np.array(args.translate or (0.0, 0.0, 0.0)))
     save_ply(args.out, edit_gaussians(gaussians, affine, is_selected), load_label(args.model))
     print(f"{is_selected.sum():,} of {len(means):,} Gaussians edited, in {args.out}")
     return 0
 
 
-def _linear(args: argparse.Namespace) -> Floats:
+def _read_matrix(args: argparse.Namespace) -> Floats:
     """Return the matrix A [3, 3] that the arguments describe."""
     if args.matrix is not None:
         if args.scale is not None or args.rotate is not None:
@@ -91,7 +207,7 @@ def _linear(args: argparse.Namespace) -> Floats:
     scale = args.scale or [1.0]
     if len(scale) not in (1, 3):
         raise InputError(f"--scale has {len(scale)} numbers: give one factor, or three, one for each axis")
-    return rotation_about(args.rotate or (0.0, 0.0, 0.0)) * np.broadcast_to(scale, 3)
+    return make_rotation(args.rotate or (0.0, 0.0, 0.0)) * np.broadcast_to(scale, 3)
 
 
 def _select(args: argparse.Namespace, means: Floats) -> Bools:
@@ -100,9 +216,9 @@ def _select(args: argparse.Namespace, means: Floats) -> Bools:
         raise InputError("--near MESH and --within D belong together: give both, or neither")
     is_selected = np.ones(len(means), bool)
     if args.box is not None:
-        is_selected &= in_box(means, np.array(args.box[:3]), np.array(args.box[3:]))
+        is_selected &= are_in_box(means, np.array(args.box[:3]), np.array(args.box[3:]))
     if args.sphere is not None:
-        is_selected &= in_ball(means, np.array(args.sphere[:3]), args.sphere[3])
+        is_selected &= are_in_ball(means, np.array(args.sphere[:3]), args.sphere[3])
     if args.near is not None:
 
         def bar(parts: Any) -> Any:

@@ -9,18 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.proxies.affine import in_box
-from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
-from minisplat_ref.extensions.proxies.follow import add_reach
+from minisplat_ref.extensions.proxies.binding import add_reach, bind, check_bound, rebuild
+from minisplat_ref.extensions.proxies.edit import are_in_box
 from minisplat_ref.extensions.proxies.mass_spring import (
     Floor,
     Sheet,
     State,
+    choose_stiffness,
     energies,
     integrate,
     longest_step,
+    make_springs,
+    vertex_masses,
 )
-from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import orbits, viewpoints
 from minisplat_ref.io.atomic import making_folder
@@ -57,19 +58,19 @@ class Setting(NamedTuple):
     is_pinned: Bools
     """[P] True where a vertex does not move."""
     stretch: float
-    """See :func:`~minisplat_ref.extensions.proxies.springs.stiffness_for_stretch`."""
+    """See :func:`~minisplat_ref.extensions.proxies.mass_spring.choose_stiffness`."""
     drag: float
     """1 / second."""
     drop: float | None
     """Distance of the floor below the lowest vertex, world units; None for no floor."""
 
 
-def sheet_of(mesh: Mesh, setting: Setting) -> Sheet:
+def make_sheet(mesh: Mesh, setting: Setting) -> Sheet:
     """Return the mesh as a sheet at rest with mass 1 per unit of area."""
     g = float(np.linalg.norm(setting.gravity))
     masses = vertex_masses(mesh, 1.0)
-    stiffness = stiffness_for_stretch(mesh, float(masses.sum()) * g, setting.stretch)
-    springs = springs_of(mesh, stiffness)
+    stiffness = choose_stiffness(mesh, float(masses.sum()) * g, setting.stretch)
+    springs = make_springs(mesh, stiffness)
     floor = None
     if setting.drop is not None:
         height = float((mesh.vertices @ (-setting.gravity / g)).min()) - setting.drop
@@ -124,8 +125,8 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     gaussians, mesh, label = load_model(args.model), load_mesh(args.mesh), load_label(args.model)
     setting = Setting(np.array(args.gravity), _select_pinned(args, mesh), args.stretch, args.drag, args.floor)
-    camera = _camera(args.cameras, gaussians.means)
-    sheet = sheet_of(mesh, setting)
+    camera = _choose_camera(args.cameras, gaussians.means)
+    sheet = make_sheet(mesh, setting)
     n_steps = max(1, int(np.ceil(args.seconds / (args.frames - 1) / (STEP_FRACTION * longest_step(sheet)))))
     step = args.seconds / (args.frames - 1) / n_steps
     state = State(mesh.vertices, np.zeros_like(mesh.vertices))
@@ -177,7 +178,7 @@ def _select_pinned(args: argparse.Namespace, mesh: Mesh) -> Bools:
     if args.pin_top > 0:
         is_pinned |= heights >= heights.max() - args.pin_top * np.ptp(heights)
     if args.pin_box is not None:
-        is_pinned |= in_box(mesh.vertices, np.array(args.pin_box[:3]), np.array(args.pin_box[3:]))
+        is_pinned |= are_in_box(mesh.vertices, np.array(args.pin_box[:3]), np.array(args.pin_box[3:]))
         if not is_pinned.any():
             raise InputError("--pin-box holds no vertex of the mesh: give a larger one")
     if is_pinned.all():
@@ -185,7 +186,7 @@ def _select_pinned(args: argparse.Namespace, mesh: Mesh) -> Bools:
     return is_pinned
 
 
-def _camera(cameras: Path | None, means: Floats) -> Camera:
+def _choose_camera(cameras: Path | None, means: Floats) -> Camera:
     """Return the first camera of a file, or one that sees the whole scene."""
     if cameras is not None:
         return viewpoints.read(cameras)[0].camera

@@ -1,7 +1,7 @@
 """Satellite: affine cameras, the sun's shadows and the light of each photograph.
 
 From 500 km away all rays are parallel but for a thousandth, so a satellite's camera is an affine map, fitted to the
-rational polynomials that come with its images (:mod:`.rpc`, :mod:`.affine_fit`). This follows EOGS, Aira et al. 2024,
+rational polynomials that come with its images (:mod:`.cameras`). This follows EOGS, Aira et al. 2024,
 "Gaussian Splatting for Efficient Satellite Image Photogrammetry", arXiv 2412.13047::
 
     mean = A x + b,   Sigma2 = A_xy Sigma A_xy^T + 0.3 I          exactly; the highest first
@@ -25,21 +25,20 @@ renders.
 This deviates from the paper as follows. Altitudes are divided by alpha; where almost nothing is, alpha counts as 0.05.
 The exponent 0.4 and the limit 0.3 are per metre. Rates, the nearly transparent start, the random background and the
 opacity threshold of pruning are ours: points in a volume begin as a fog, and on black a translucent surface of bright
-colours looks like an opaque one. The start helps a ground at the lowest altitude (:mod:`.method`).
+colours looks like an opaque one. The start helps a ground at the lowest altitude (:mod:`.recipe`).
 
 Left out are the registration of a surface model to a reference, panchromatic images and sensors whose RPC has to be
 corrected (bundle adjustment); image positions have to be right already.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.satellite import surface_model, training
-from minisplat_ref.extensions.satellite.gradient_checks import stages
-from minisplat_ref.extensions.satellite.method import RECIPE, SEEN_FROM_ABOVE
+from minisplat_ref.extensions.satellite import commands
+from minisplat_ref.extensions.satellite.recipe import RECIPE, SEEN_FROM_ABOVE, stages
 
 EXTENSION = Extension(
     "satellite",
     recipes=(RECIPE,),
     representation=SEEN_FROM_ABOVE,
-    commands=(training, surface_model),
+    commands=(commands,),
     stages=stages,
 )

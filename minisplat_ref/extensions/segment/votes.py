@@ -62,7 +62,7 @@ def count_votes(population: Any, renderer: Renderer, views: Iterable[tuple[Camer
     population : Gaussians, or a relative's population
         N primitives; their colours do not matter.
     renderer : Renderer
-        Draws them.
+        Theirs.
     views : iterable of tuples (Camera, ndarray of shape (H, W) of int)
         Cameras, in the world of the population, each with its mask of labels.
     ids : sequence of ints

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from minisplat_ref.extensions.wave.reference import Complexes, Flats, Waves
+from minisplat_ref.extensions.wave.model import Complexes, Flats, Waves
 from minisplat_ref.jit.compile import kernel, prange
 from minisplat_ref.types import Floats
 
@@ -42,7 +42,7 @@ def _sum_spectra(centers, axes, scales, weights, k, carrier, z, total):
 
 
 def sum_spectra(flats: Flats, weights: Floats, waves: Waves, z: float = 0.0) -> Complexes:
-    """Return the spectrum [rows, columns] of flat Gaussians with weights [N]: ``reference.spectrum`` on a grid."""
+    """Return the spectrum [rows, columns] of flat Gaussians with weights [N]: ``model.spectrum`` on a grid."""
     total = np.zeros(waves.k.shape[:-1], np.complex128)
     arrays = (np.ascontiguousarray(field, np.float64) for field in (*flats, weights, waves.k))
     _sum_spectra(*arrays, 1 / waves.wavelength, float(z), total)

@@ -1,0 +1,246 @@
+"""The losses of EOGS, the recipe ``satellite``, and what the gradient check covers.
+
+Few Gaussians are opaque, a camera beside sees the same surface, and shadows are there or not.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from minisplat_ref.constants import SH_C0
+from minisplat_ref.extensions.satellite.cameras import AFFINE
+from minisplat_ref.extensions.satellite.model import (
+    CHANNELS,
+    IN_SHADOW,
+    MIN_ALPHA,
+    RADIOMETRY,
+    REFERENCE_VIEW,
+    SATELLITE,
+    Tape,
+    altitudes,
+    altitudes_vjp,
+    choose_affine,
+    depth_sums,
+    sample,
+    sample_vjp,
+    sheared,
+    splat_view,
+    splat_view_vjp,
+)
+from minisplat_ref.methods.gaussian_splatting import GS, lower_opacities, prune_faint
+from minisplat_ref.oracle.models import Drawn, model_stage
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
+from minisplat_ref.training.rates import LogLinear, Rates
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Camera, Floats, Gaussians, Optics, Scene
+
+FLOOR = 1e-6  # of a shadow and of its complement in the entropy, whose slope at 0 has no bound
+ITERATIONS = 5_000
+START_OPACITY, START_SIZE = 0.005, 0.5  # of points in the volume; size relative to the distance of neighbours
+SKY_LIGHT = 0.05  # k at the start
+ALL = frozenset(CHANNELS)
+TIE = 1e-12
+"""Of a shadow or a slope, in float64: a thousand roundings of values near 1."""
+
+
+def opacity_sparsity(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return ``sum o / N_0``, N_0 the number of points that training begins with.
+
+    ``dL/dlogit = o (1 - o) / N_0``.
+    """
+    logits = rendered.model.gaussians.opacity_logits
+    o = 1 / (1 + np.exp(-logits))
+    n = max(len(rendered.scene.points), 1)
+    return float(o.sum() / n), Cotangents(gaussians={"opacity_logits": o * (1 - o) / logits.dtype.type(n)})
+
+
+def shadow_entropy(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return the mean of ``-s ln s - (1 - s) ln(1 - s)``; its slope is ``ln((1 - s) / s)``, 0 where s is 0 or 1."""
+    s = rendered.channel("shadow")
+    inside = (s > FLOOR) & (s < 1 - FLOOR)
+    kept = np.where(inside, s, s.dtype.type(0.5))
+    entropy = -kept * np.log(kept) - (1 - kept) * np.log(1 - kept)
+    slope = np.where(inside, np.log((1 - kept) / kept), 0).astype(s.dtype) / s.dtype.type(s.size)
+    return float(np.sum(np.where(inside, entropy, 0)) / s.size), Cotangents({"shadow": slope})
+
+
+def make_shear(rendered: Rendered, noise: float) -> tuple[float, float]:
+    """Return a random shear of the view in pixels per unit of altitude, the same whenever the iteration is done.
+
+    ``M' = I + noise`` of the paper is in coordinates of -1 to 1; there the altitudes of the Gaussians span 2.
+    """
+    camera = choose_affine(rendered.view.camera, rendered.request.conventions)
+    held = rendered.constant.model.gaussians.means
+    z = held @ np.asarray(camera.cam_from_world_R, np.float64)[2]
+    half = max(float(np.ptp(z)) / 2, 1e-9) if len(z) else 1.0
+    x, y = np.random.default_rng([rendered.step, max(rendered.view.view_id, 0)]).normal(size=2)
+    return noise * x * camera.width / 2 / half, noise * y * camera.height / 2 / half
+
+
+def view_consistency(
+    rendered: Rendered, *, altitude: float, color: float, noise: float, limit: float
+) -> tuple[float, Cotangents]:
+    """Compare the view with one that is sheared at random: both see the same albedo and altitude of a point.
+
+    A pixel p of altitude h is seen at ``p' = p - g h``. Where ``|h - h'(p')| < limit``, else something hides it::
+
+        L = mean(w_h |h - h'(p')| + w_a mean_c |a - a'(p')|)
+
+    Derivatives go to the view's channels and, by the second rendering, to the population; a' and h' are read between
+    pixels, so p' depends on h.
+
+    Parameters
+    ----------
+    rendered : Rendered
+        With ``albedo`` and ``altitude``.
+    altitude, color : float
+        w_h, per unit of altitude, and w_a.
+    noise : float
+        Standard deviation of the shear; see :func:`make_shear`.
+    limit : float
+        Units of altitude.
+    """
+    h, a = rendered.channel("altitude")[..., 0], rendered.channel("albedo")
+    camera = choose_affine(rendered.view.camera, rendered.request.conventions)
+    shift = make_shear(rendered, noise)
+    tape = splat_view(rendered.model, sheared(camera, shift, (0, 0)), rendered.request)
+    sums, alpha = depth_sums(tape)
+    other = np.concatenate([tape.output.image[..., :3], altitudes(sums, alpha)[..., None]], axis=2)
+    height, width = h.shape
+    x, y = np.arange(width) + 0.5 - shift[0] * h, np.arange(height)[:, None] + 0.5 - shift[1] * h
+    read = sample(other, x, y)
+    differences = np.concatenate([a, h[..., None]], axis=2) - read.values  # [H, W, 4]
+    is_seen = (np.abs(differences[..., 3]) < limit) & (x > 0) & (x < width) & (y > 0) & (y < height)
+    weights = np.array([color / 3] * 3 + [altitude]) / h.size
+    v = (np.sign(differences) * weights * is_seen[..., None]).astype(h.dtype)  # [H, W, 4]
+    v_other, v_places = sample_vjp(read, other.shape, -v)
+    v_h = v[..., 3] - shift[0] * v_places[0] - shift[1] * v_places[1]
+    of_h = altitudes_vjp(sums, alpha, v_other[..., 3])
+    v_image = np.concatenate([v_other[..., :3], of_h.sums[..., None]], axis=2)
+    population, _ = splat_view_vjp(rendered.model, tape, np.ascontiguousarray(v_image), of_h.alpha)
+    value = float(np.sum(np.abs(differences) * weights * is_seen[..., None]))
+    direct: dict[str, Floats] = {name: field for name, field in population._asdict().items() if name != "sh_rest"}
+    return value, Cotangents({"albedo": v[..., :3], "altitude": v_h[..., None]}, gaussians=direct)
+
+
+SPARSITY = LossTerm("opacity_sparsity", opacity_sparsity, weight=0.1)
+ENTROPY = LossTerm("shadow_entropy", shadow_entropy, weight=0.01, wants=frozenset({"shadow"}))
+
+
+def without_directions(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Return Gaussians without the harmonics of degree 1 and above, which parallel rays cannot tell from the first."""
+    return gaussians._replace(sh_rest=np.ascontiguousarray(gaussians.sh_rest[:, :0]))
+
+
+def first_light(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
+    """Return identity radiometry [V, 3, 4] and the light of the sky [V, 3] in each photograph's shadows."""
+    n, dtype = len(scene.train_views), np.float32
+    return {RADIOMETRY: np.tile(np.eye(3, 4, dtype=dtype), (n, 1, 1)), IN_SHADOW: np.full((n, 3), SKY_LIGHT, dtype)}
+
+
+def begin_transparent(state: TrainState, iteration: Iteration, *, opacity: float, size: float) -> None:
+    """Give all Gaussians one opacity, and multiply their sizes, so that light passes through the whole volume.
+
+    Points that fill a volume are a fog if they are as opaque as those on a surface (0.1), and a fog explains a few
+    photographs as well as a surface does. Of nearly transparent ones some grow, and the others are pruned. As long as
+    nearly nothing is opaque, altitudes count as the lowest and nothing shades: this helps a ground that lies there.
+    """
+    g = state.gaussians
+    lower_opacities(state, np.full_like(g.opacity_logits, np.log(opacity / (1 - opacity))))
+    log_scales = g.log_scales + g.log_scales.dtype.type(np.log(size))
+    state.gaussians = state.gaussians._replace(log_scales=log_scales)
+
+
+def hold_sky(state: TrainState, iteration: Iteration) -> None:
+    """Keep the light in shadows between none and the sun's: while surfaces are unsettled, its gradient is unbounded."""
+    np.clip(state.shared[IN_SHADOW], 0, 1, out=state.shared[IN_SHADOW])
+
+
+def fold_reference(state: TrainState, iteration: Iteration) -> str | None:
+    """Give the colours the radiometry of the reference photograph, and every photograph its own relative to it.
+
+    With C_0 and c_0 of the reference: ``a' = C_0 a + c_0``, ``C' = C C_0^-1``, ``c' = c - C' c_0``. All photographs
+    stay the same where nothing of the background comes through.
+    """
+    radiometry = state.shared[RADIOMETRY]
+    first = radiometry[REFERENCE_VIEW].astype(np.float64)
+    C, c = first[:, :3], first[:, 3]
+    if np.linalg.cond(C) > 1e6:
+        return "nothing done: the reference's colour matrix cannot be inverted"
+    g = state.gaussians
+    colors = np.maximum(0.5 + SH_C0 * g.sh_dc.astype(np.float64), 0) @ C.T + c
+    state.gaussians = g._replace(sh_dc=((colors - 0.5) / SH_C0).astype(g.sh_dc.dtype))
+    matrices = radiometry[..., :3] @ np.linalg.inv(C)
+    radiometry[..., 3] -= (matrices @ c).astype(radiometry.dtype)
+    radiometry[..., :3] = matrices
+    return None
+
+
+CONSISTENCY = LossTerm(
+    "view_consistency",
+    partial(view_consistency, altitude=0.01, color=0.1, noise=0.01, limit=0.3),
+    weight=1.0,
+    wants=frozenset({"albedo", "altitude"}),
+)
+
+SEEN_FROM_ABOVE = Representation(
+    "gaussians seen by satellites",
+    extend=without_directions,
+    shared=first_light,
+    renderer=SATELLITE,
+    rates=Rates({RADIOMETRY: 0.001, IN_SHADOW: 0.01}, frozenset()),
+    takes_optics=True,
+)
+
+RECIPE = GS._replace(
+    name="satellite",
+    iterations=ITERATIONS,
+    learning_rates=GS.learning_rates.change(means=LogLinear(6.4e-3, 6.4e-4, ITERATIONS), opacity_logits=0.1),
+    sh_degree=0,
+    sh_milestones=(),
+    has_random_background=True,
+    losses=(*GS.losses, SPARSITY, CONSISTENCY, ENTROPY),
+    events=(
+        At(1, partial(begin_transparent, opacity=START_OPACITY, size=START_SIZE)),
+        During(hold_sky),
+        Every(100, partial(prune_faint, min_opacity=0.005), start=500, min_gap=20),
+        At(ITERATIONS, fold_reference),
+    ),
+)
+"""``satellite``: no density control but pruning, colours without directions, 5,000 iterations."""
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the renderer with the sun: by an orthographic camera, instead of that without, and by an affine one.
+
+    The affine camera, as those of satellites, has depths of both signs.
+    """
+    per_unit = np.array([setting.camera.fx, setting.camera.fy, 1.0]) / 3  # the Gaussians lie at depth 3
+    shift = 1.3, -0.9
+    A = per_unit[:, None] * (setting.camera.cam_from_world_R + 0.02 * rng.normal(size=(3, 3)))
+    b = per_unit * setting.camera.cam_from_world_t + [setting.camera.width / 2, setting.camera.height / 2, -1]
+    flat = setting.camera._replace(fx=per_unit[0], fy=per_unit[1], optics=Optics("orthographic", shift))
+    affine = Camera(A, b, 1.0, 1.0, 0.0, 0.0, flat.width, flat.height, Optics(AFFINE, shift))
+    name = SEEN_FROM_ABOVE.name
+    return _stage(backend, setting, flat, name, rng), _stage(backend, setting, affine, f"{name}, {AFFINE}", rng)
+
+
+def _stage(backend: Backend, setting: Setting, camera: Camera, name: str, rng: np.random.Generator) -> Stage:
+    named = SEEN_FROM_ABOVE._replace(name=name)
+    seen = setting._replace(camera=camera)
+    return model_stage(backend, seen, named, rng, wants=ALL, sides_of=_sides, fixed=("sh_rest",))  # which is empty
+
+
+def _sides(drawn: Drawn) -> list[np.ndarray]:
+    tape: Tape = drawn.tape
+    assert tape.of_sun is not None and tape.shadow is not None
+    faint = [part.output.alpha > MIN_ALPHA for part in (tape.seen, tape.of_sun)]
+    inside = np.abs(tape.shadow.sampled.slopes) > TIE
+    is_shaded, is_lit = tape.shadow.shadows < 1 - TIE, SH_C0 * drawn.model.gaussians.sh_dc + 0.5 > 0
+    return [*faint, is_shaded, tape.shadow.sampled.corners, inside, is_lit]
