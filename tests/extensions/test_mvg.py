@@ -15,12 +15,12 @@ from minisplat_ref.extensions.mvg.insertion import (
     Insertions,
     Photographed,
     Rules,
+    assign_levels,
+    choose_grid_pixels,
     depth_cuts,
     depth_density,
-    levels_of,
-    on_grid,
+    drop_covered,
     propose,
-    uncovered,
 )
 from minisplat_ref.extensions.mvg.recipe import (
     MVG,
@@ -29,8 +29,8 @@ from minisplat_ref.extensions.mvg.recipe import (
     edge_aware_steps_vjp,
     facing,
     filtered_normals,
+    make_surfels,
     photographed,
-    surfels_at,
 )
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances
 from minisplat_ref.mechanisms.oriented.thin_axis import normals_of
@@ -69,18 +69,18 @@ def test_an_object_before_a_wall_is_near(rng):
     depths = np.concatenate([rng.normal(5, 0.1, 20_000), rng.uniform(2, 3, 1_000), rng.uniform(6, 7, 500)])
     near, far = depth_cuts(depths)
     assert near == pytest.approx(5 - 0.118, abs=0.02) and far == pytest.approx(5 + 0.118, abs=0.02)
-    assert levels_of(np.array([2.5, 4.8, 5.0, 5.2, 6.5]), (near, far)).tolist() == [0, 0, 1, 2, 2]
+    assert assign_levels(np.array([2.5, 4.8, 5.0, 5.2, 6.5]), (near, far)).tolist() == [0, 0, 1, 2, 2]
 
 
 @pytest.mark.parametrize("depths", [[2.0], [2.0, 2.0, 2.0]])
 def test_a_wall_alone_is_all_middle(depths):
     cuts = depth_cuts(np.array(depths))
-    assert levels_of(np.array(depths), cuts).tolist() == [1] * len(depths)
+    assert assign_levels(np.array(depths), cuts).tolist() == [1] * len(depths)
 
 
 def test_a_grid_begins_at_its_corner():
-    assert np.argwhere(on_grid((4, 5), 3, (1, 5))).tolist() == [[1, 2]]
-    assert on_grid((4, 5), 2, (0, 1)).sum() == 4 and not on_grid((4, 5), 0, (0, 0)).any()
+    assert np.argwhere(choose_grid_pixels((4, 5), 3, (1, 5))).tolist() == [[1, 2]]
+    assert choose_grid_pixels((4, 5), 2, (0, 1)).sum() == 4 and not choose_grid_pixels((4, 5), 0, (0, 0)).any()
 
 
 # --- depth steps ---
@@ -167,7 +167,7 @@ def test_beside_a_hole_there_is_no_normal_and_no_point(rng):
 def test_nothing_is_proposed_where_nothing_agrees(rng):
     views = [seen_from(0.0, 3.0), seen_from(0.0, 3.5)]
     found = propose(views, Rules(Tolerances(n_views=1), 1, (1, 1, 1)), rng)
-    assert len(found.points) == 0 and len(uncovered(found, np.zeros((2, 3))).points) == 0
+    assert len(found.points) == 0 and len(drop_covered(found, np.zeros((2, 3))).points) == 0
 
 
 def insertions_at(points, radii):
@@ -181,8 +181,8 @@ def insertions_at(points, radii):
 def test_covered_points_are_left_out():
     """On a line: 0.5 lies near the old one at 0, 1.5 near none, 2 near 1.5 and 2.6 near 2 alone, which is gone."""
     found = insertions_at([[0.5, 0, 0], [1.5, 0, 0], [2.0, 0, 0], [2.6, 0, 0]], [0.7] * 4)
-    assert uncovered(found, np.zeros((1, 3))).points[:, 0].tolist() == [1.5, 2.6]
-    assert uncovered(found, np.zeros((0, 3))).points[:, 0].tolist() == [0.5, 1.5, 2.6]
+    assert drop_covered(found, np.zeros((1, 3))).points[:, 0].tolist() == [1.5, 2.6]
+    assert drop_covered(found, np.zeros((0, 3))).points[:, 0].tolist() == [0.5, 1.5, 2.6]
 
 
 def test_a_surfel_faces_as_its_normal(rng):
@@ -190,12 +190,12 @@ def test_a_surfel_faces_as_its_normal(rng):
     normals = np.vstack([normals / np.linalg.norm(normals, axis=1, keepdims=True), [[0, 0, 1], [0, 0, -1]]])
     like = Gaussians(*(np.zeros((1, *shape)) for shape in ((3,), (4,), (3,), (), (3,), (15, 3))))
     found = insertions_at(rng.normal(size=(42, 3)), np.full(42, 0.2))._replace(normals=normals)
-    surfels = surfels_at(found, like)
+    surfels = make_surfels(found, like)
     assert_allclose(normals_of(surfels), normals, atol=1e-12)
     assert_allclose(surfels.log_scales[0], [np.log(0.2), np.log(0.2), -16], rtol=CLOSED_FORM)
     assert_allclose(1 / (1 + np.exp(-surfels.opacity_logits)), 0.1, rtol=CLOSED_FORM)
     assert surfels.sh_rest.shape == (42, 15, 3) and not surfels.sh_dc.any()  # grey 0.5 is all zeros
-    bright = surfels_at(found._replace(colors=np.full((42, 3), 1.0)), like)
+    bright = make_surfels(found._replace(colors=np.full((42, 3), 1.0)), like)
     assert_allclose(0.5 + SH_C0 * bright.sh_dc, 1.0, rtol=CLOSED_FORM)
 
 

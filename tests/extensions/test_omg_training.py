@@ -14,6 +14,7 @@ from minisplat_ref.extensions.omg.model import (
     COMPACT,
     PLACE,
     OmgGaussians,
+    add_features,
     decode,
     decode_vjp,
     encode_places,
@@ -22,7 +23,6 @@ from minisplat_ref.extensions.omg.model import (
     measure_place,
     run_networks,
     split_codes,
-    with_features,
     without_features,
 )
 from minisplat_ref.extensions.omg.recipe import (
@@ -157,7 +157,7 @@ def test_codebooks_as_large_as_the_population_are_the_population(gaussians, rng)
 
 
 def test_kernels_and_numpy_decode_alike(gaussians, scene, rng):
-    model = Model(with_features(gaussians, rng), COMPACT.shared(scene, rng))
+    model = Model(add_features(gaussians, rng), COMPACT.shared(scene, rng))
     (ours, tape), (theirs, other) = decode(model, COMPILED), decode(model, IN_NUMPY)
     assert_allclose(ours.sh_rest, theirs.sh_rest, atol=PARITY_FLOAT32_GRADIENT * np.abs(theirs.sh_rest).max())
     v = theirs._replace(features=0 * theirs.features)

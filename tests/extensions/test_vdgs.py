@@ -19,11 +19,11 @@ from minisplat_ref.extensions.vdgs.model import (
     RADIUS,
     TABLE,
     VIEW_DEPENDENT,
-    as_seen,
     both_plus,
     both_times,
-    levels_of,
+    find_levels,
     modulate,
+    modulate_model,
     modulate_vjp,
     modulated_logits,
     modulated_logits_vjp,
@@ -84,7 +84,7 @@ def test_outputs_arrive_where_they_belong(modulation, rng):
     shared = {name: 0 * array if "weights" in name else array for name, array in shared.items()}
     y = 0.01 * np.arange(1, 1 + mode.opacity + 12 * mode.colors)
     shared[f"{NAME}_biases_1"] = y
-    seen, _ = as_seen(Model(g, shared), turned_camera(), mode, IN_NUMPY)
+    seen, _ = modulate_model(Model(g, shared), turned_camera(), mode, IN_NUMPY)
     o = 1 / (1 + np.exp(-g.opacity_logits))
     if mode.opacity:
         raw = o + 0.01 if mode.is_sum else 1.01 * o
@@ -207,7 +207,7 @@ def test_the_place_of_a_scene_without_points(rng):
 
 
 def test_cells_from_16_to_128():
-    assert levels_of(np.zeros((4, 2**12, 2))).resolutions == (16, 32, 64, 128)
+    assert find_levels(np.zeros((4, 2**12, 2))).resolutions == (16, 32, 64, 128)
 
 
 # Runs

@@ -13,7 +13,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.velocity.model import MOVING, MovingGaussians, means_at, means_at_vjp
+from minisplat_ref.extensions.velocity.model import MOVING, MovingGaussians, move_means, move_means_vjp
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import load_ply, save_ply
@@ -106,8 +106,8 @@ def test_velocities_begin_to_move_five_times_as_fast_as_the_means():
 
 def test_the_gradient_of_the_motion(rng):
     check_jacobian(
-        lambda means, velocities: (means_at(means, velocities, 0.7),),
-        lambda v: means_at_vjp(0.7, v),
+        lambda means, velocities: (move_means(means, velocities, 0.7),),
+        lambda v: move_means_vjp(0.7, v),
         [rng.normal(size=(3, 3)), rng.normal(size=(3, 3))],
         names=["means", "velocities"],
     )

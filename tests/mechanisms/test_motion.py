@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_jacobian
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.velocity.model import means_at
+from minisplat_ref.extensions.velocity.model import move_means
 from minisplat_ref.mechanisms.motion.field import (
     basis,
     choose_centers,
@@ -80,7 +80,7 @@ def test_degree_1_is_linear_motion(rng):
     places = rng.normal(size=(7, 3))
     velocities = warp.rate(places, 0.0)
     assert_array_equal(warp.rate(places, 0.9), velocities)
-    assert_array_equal(warp.at(places, 0.5), means_at(places, velocities, 0.5))  # a half is exact
+    assert_array_equal(warp.at(places, 0.5), move_means(places, velocities, 0.5))  # a half is exact
 
 
 def test_centers_are_spread_and_leave_out_what_is_far(rng):

@@ -25,7 +25,7 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import subplots, summarise
 from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.datasets.synthetic.cameras import look_at
-from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, as_seen, opacity_plus
+from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, modulate_model, opacity_plus
 from minisplat_ref.interface.palette import BLUE, OCHRE, RED
 from minisplat_ref.mechanisms.networks.directions import directions
 from minisplat_ref.mechanisms.networks.networks import COMPILED
@@ -136,7 +136,7 @@ def pane_opacities(model: Model, recipe: Recipe, camera: Camera) -> Floats:
     seen = model.gaussians
     if model.shared:
         mode = recipe.renderer.render.keywords["modulation"]()  # type: ignore[attr-defined]
-        seen, _ = as_seen(model, camera, mode, COMPILED)
+        seen, _ = modulate_model(model, camera, mode, COMPILED)
     opacities: Floats = activate(seen).opacities[: SIDE**2]
     return opacities
 

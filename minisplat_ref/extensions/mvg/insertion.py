@@ -82,13 +82,13 @@ def depth_cuts(depths: Floats) -> tuple[float, float]:
     return float(density.depths[first]), float(density.depths[last])
 
 
-def levels_of(depths: Floats, cuts: tuple[float, float]) -> Ints:
+def assign_levels(depths: Floats, cuts: tuple[float, float]) -> Ints:
     """Return 0, 1 or 2 for each depth: near, middle, far."""
     near, far = cuts
     return np.where(depths < near, NEAR, np.where(depths > far, FAR, MIDDLE))
 
 
-def on_grid(shape: tuple[int, int], stride: int, corner: tuple[int, int]) -> Bools:
+def choose_grid_pixels(shape: tuple[int, int], stride: int, corner: tuple[int, int]) -> Bools:
     """Return which pixels [H, W] are those of every ``stride``-th row and column, from a corner on; none for 0."""
     chosen = np.zeros(shape, bool)
     if stride:
@@ -165,14 +165,16 @@ def propose(views: Sequence[Photographed], rules: Rules, rng: np.random.Generato
     known = np.concatenate([depth[depth > 0] for depth in fused])
     cuts = depth_cuts(known) if len(known) else (0.0, 0.0)
     parts = [
-        _of_view(view._replace(seen=view.seen._replace(depth=depth)), view.seen.depth, cuts, rules.strides, i, rng)
+        _propose_in_view(
+            view._replace(seen=view.seen._replace(depth=depth)), view.seen.depth, cuts, rules.strides, i, rng
+        )
         for i, (view, depth) in enumerate(zip(views, fused, strict=True))
     ]
     joined: list[Any] = [np.concatenate(fields) for fields in zip(*parts, strict=True)]
     return Insertions(*joined)
 
 
-def _of_view(
+def _propose_in_view(
     view: Photographed,
     smooth: Floats,
     cuts: tuple[float, float],
@@ -182,12 +184,12 @@ def _of_view(
 ) -> Insertions:
     """Return the points of one view, whose depths are those agreed upon; normals are of the depths before that."""
     depth, camera = view.seen.depth, view.seen.camera
-    levels = levels_of(depth, cuts)
+    levels = assign_levels(depth, cuts)
     normals = central_normals(smooth.astype(np.float64), camera)
     is_chosen = np.zeros(depth.shape, bool)
     for level, stride in enumerate(strides):
         corner = rng.integers(0, max(stride, 1), 2)
-        is_chosen |= (levels == level) & on_grid(depth.shape, stride, (int(corner[0]), int(corner[1])))
+        is_chosen |= (levels == level) & choose_grid_pixels(depth.shape, stride, (int(corner[0]), int(corner[1])))
     is_chosen &= (depth > 0) & _is_inner(smooth) & (np.abs(normals).sum(axis=2) > 0)
     pixels = np.flatnonzero(is_chosen)
     spacing = np.take(strides, levels[is_chosen]) / np.sqrt(camera.fx * camera.fy)
@@ -210,7 +212,7 @@ def _is_inner(depth: Floats) -> Bools:
     return inner
 
 
-def uncovered(found: Insertions, older: Floats) -> Insertions:
+def drop_covered(found: Insertions, older: Floats) -> Insertions:
     """Return the insertions that are further than their radius from older points [N, 3] and from those before them."""
     is_kept = np.ones(len(found.points), bool)
     if len(older):

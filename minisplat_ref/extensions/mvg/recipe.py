@@ -15,9 +15,9 @@ from minisplat_ref.extensions.mvg.insertion import (
     Insertions,
     Photographed,
     Rules,
+    drop_covered,
     propose,
     smooth_map,
-    uncovered,
 )
 from minisplat_ref.mechanisms.depth_maps.bilateral import joint_bilateral_depth, joint_bilateral_depth_vjp
 from minisplat_ref.mechanisms.depth_maps.reprojection import DepthView, Tolerances
@@ -133,10 +133,10 @@ def insert_consistent(
     views = [photographed(state.model, view.load(), settings) for view in iteration.scene.train_views]
     rules = Rules(Tolerances(n_views=n_views), n_sources, (near_stride, 0, far_stride))
     g = state.gaussians
-    found = uncovered(propose(views, rules, state.rng), g.means)
+    found = drop_covered(propose(views, rules, state.rng), g.means)
     if len(found.points) == 0:
-        return "nothing done: no pixel that views agree on is uncovered"
-    new = surfels_at(found, g)
+        return "nothing done: no pixel that views agree on is drop_covered"
+    new = make_surfels(found, g)
     parents = np.concatenate([np.arange(n_rows(g)), np.full(n_rows(new), NO_PARENT)])
     apply_edit(state, Edit(concat(g, new), parents, parents == NO_PARENT))
     return None
@@ -154,7 +154,7 @@ def photographed(model: Model, view: View, settings: RenderSettings) -> Photogra
     return smooth_map(Photographed(DepthView(depth, camera), view.image.astype(depth.dtype) / depth.dtype.type(255)))
 
 
-def surfels_at(found: Insertions, like: Gaussians) -> Gaussians:
+def make_surfels(found: Insertions, like: Gaussians) -> Gaussians:
     """Return a disc at each insertion, with its normal as the third axis, of the fields and dtype of a population."""
     log_scales = np.log(found.radii)
     fields = {

@@ -33,7 +33,7 @@ same only if the rows are sorted already; here it is the inverse.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.file import OMG_FILE
-from minisplat_ref.extensions.omg.model import COMPACT, load_plain, save_plain, stages, with_features
+from minisplat_ref.extensions.omg.model import COMPACT, add_features, load_plain, save_plain, stages
 from minisplat_ref.extensions.omg.recipe import OMG
 
 EXTENSION = Extension(
@@ -44,7 +44,7 @@ EXTENSION = Extension(
     load=load_plain,
     saves_plain=True,
     stages=stages,
-    sample=with_features,
+    sample=add_features,
     commands=(trained_file,),
     formats=(OMG_FILE,),
 )

@@ -91,7 +91,7 @@ def without_features(gaussians: Gaussians, rng: np.random.Generator) -> OmgGauss
     return OmgGaussians(**fields, features=nothing, codes=nothing.copy())
 
 
-def with_features(gaussians: Gaussians, rng: np.random.Generator) -> OmgGaussians:
+def add_features(gaussians: Gaussians, rng: np.random.Generator) -> OmgGaussians:
     """Return the Gaussians with random features around their colours, without codes."""
     view = 0.1 * rng.normal(size=(len(gaussians.means), N_VIEW)).astype(gaussians.means.dtype)
     features = np.concatenate([gaussians.sh_dc, view], axis=1)

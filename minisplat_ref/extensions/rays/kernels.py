@@ -83,12 +83,12 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return back(records, row, of_p), back(records, row, of_v), of_map
 
 
-def _maps_of(tree: RayTree, v_maps: Floats) -> Floats:
+def _sum_maps(tree: RayTree, v_maps: Floats) -> Floats:
     """Return the gradient of each Gaussian's map [N, 3, 3] from those of the rows [N', 9], each of which is one."""
     v: Floats = np.zeros((tree.n, 3, 3))
     v[tree.gaussian_ids] = v_maps.reshape(-1, 3, 3)
     return v
 
 
-RESPONSE = RayResponse(meet, meet_vjp, 9, _maps_of)
+RESPONSE = RayResponse(meet, meet_vjp, 9, _sum_maps)
 """A 3D Gaussian where its density on the ray is greatest."""

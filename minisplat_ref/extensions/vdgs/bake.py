@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         It is no run of this recipe that has ended, or has no such view; a file alone has no network.
     """
-    from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, as_seen, opacity_times
+    from minisplat_ref.extensions.vdgs.model import VDGS, VIEW_DEPENDENT, modulate_model, opacity_times
     from minisplat_ref.io import viewpoints
     from minisplat_ref.io.checkpoint import load_checkpoint
     from minisplat_ref.io.frames import place_camera, return_fields
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     chosen = dict(setting.split("=", 1) for setting in read_label(folder / POINT_CLOUD).set)
     modulation = find_alternatives(opacity_times)[chosen.get("modulation", opacity_times.__name__)]
     model = Model(bundles.gaussians, bundles.shared)
-    seen, _ = as_seen(model, place_camera(cameras[args.view], frame), modulation(), IN_NUMPY)
+    seen, _ = modulate_model(model, place_camera(cameras[args.view], frame), modulation(), IN_NUMPY)
     save_ply(args.out, Gaussians(**return_fields(seen._asdict(), VIEW_DEPENDENT.units, frame)))
     print(f"{len(seen.means):,} Gaussians as view {args.view} sees them in {args.out}; other views see others")
     return 0

@@ -197,43 +197,43 @@ def initial_shared(scene: Scene, rng: np.random.Generator, *, modulation: Callab
     return {name: array.astype(np.float32) for name, array in shared.items()}
 
 
-def levels_of(table: Floats) -> Levels:
+def find_levels(table: Floats) -> Levels:
     """Return the levels of a table [L, T, F]."""
     return make_levels(table.shape[0], COARSEST, FINEST, n_rows=table.shape[1], n_features=table.shape[2])
 
 
-def _in_dtype(shared: Mapping[str, Floats], means: Floats) -> dict[str, Floats]:
+def _cast(shared: Mapping[str, Floats], means: Floats) -> dict[str, Floats]:
     return {name: np.ascontiguousarray(array, means.dtype) for name, array in shared.items()}
 
 
-def as_seen(model: Model, camera: Camera, mode: Mode, networks: Networks) -> tuple[Gaussians, Tape]:
+def modulate_model(model: Model, camera: Camera, mode: Mode, networks: Networks) -> tuple[Gaussians, Tape]:
     """Return the Gaussians of 3DGS that a camera sees, and the tape."""
-    g, shared = model.gaussians, _in_dtype(model.shared, model.gaussians.means)
+    g, shared = model.gaussians, _cast(model.shared, model.gaussians.means)
     d, distances = directions(g.means, camera)
     places = (contract((g.means - shared[CENTER]) / shared[RADIUS]) + 2) / 4
-    encoding = networks.hash_grid(shared[TABLE], places, levels_of(shared[TABLE]))
+    encoding = networks.hash_grid(shared[TABLE], places, find_levels(shared[TABLE]))
     y, inputs = networks.forward(from_shared(NAME, shared), np.concatenate([d, encoding], axis=1))
     opacities, seen = None, g
     if mode.opacity:
         opacities = modulated_logits(g.opacity_logits, y[:, 0], mode.is_sum)
         seen = seen._replace(opacity_logits=opacities.logits)
     if mode.colors:
-        y_dc, y_rest = _of_colors(y, mode, g)
+        y_dc, y_rest = _split_colors(y, mode, g)
         seen = seen._replace(
             sh_dc=modulate(g.sh_dc, y_dc, mode.is_sum), sh_rest=modulate(g.sh_rest, y_rest, mode.is_sum)
         )
     return seen, Tape(model, mode, networks, camera, d, distances, y, inputs, opacities)
 
 
-def _of_colors(y: Floats, mode: Mode, g: Gaussians) -> tuple[Floats, Floats]:
+def _split_colors(y: Floats, mode: Mode, g: Gaussians) -> tuple[Floats, Floats]:
     """Return the outputs for the coefficients of degree 0 [N, 3] and of the others that are stored [N, K-1, 3]."""
     n, n_rest = g.sh_rest.shape[:2]
     first = int(mode.opacity)
     return y[:, first : first + 3], y[:, first + 3 : first + 3 + 3 * n_rest].reshape(n, n_rest, 3)
 
 
-def as_seen_vjp(tape: Tape, v: RenderGradient) -> RenderGradient:
-    """Gradient of :func:`as_seen`, added to that of the rendering.
+def modulate_model_vjp(tape: Tape, v: RenderGradient) -> RenderGradient:
+    """Gradient of :func:`modulate_model`, added to that of the rendering.
 
     ::
 
@@ -241,13 +241,13 @@ def as_seen_vjp(tape: Tape, v: RenderGradient) -> RenderGradient:
         v_[d, E]    = MLP^T v_y
         v_mu       += directions^T v_d + contract^T (E^T v_E / 4) / r
     """
-    g, shared, mode, y = tape.model.gaussians, _in_dtype(tape.model.shared, tape.y), tape.mode, tape.y
+    g, shared, mode, y = tape.model.gaussians, _cast(tape.model.shared, tape.y), tape.mode, tape.y
     v_g, v_y = v.gaussians, np.zeros_like(y)
     if tape.opacities is not None:
         v_logits, v_y[:, 0] = modulated_logits_vjp(tape.opacities, y[:, 0], mode.is_sum, v_g.opacity_logits)
         v_g = v_g._replace(opacity_logits=v_logits)
     if mode.colors:
-        (y_dc, y_rest), (into_dc, into_rest) = _of_colors(y, mode, g), _of_colors(v_y, mode, g)
+        (y_dc, y_rest), (into_dc, into_rest) = _split_colors(y, mode, g), _split_colors(v_y, mode, g)
         v_dc, v_y_dc = modulate_vjp(g.sh_dc, y_dc, mode.is_sum, v_g.sh_dc)
         v_rest, v_y_rest = modulate_vjp(g.sh_rest, y_rest, mode.is_sum, v_g.sh_rest)
         first, end = int(mode.opacity), int(mode.opacity) + into_dc.shape[1] + into_rest[0].size
@@ -257,7 +257,7 @@ def as_seen_vjp(tape: Tape, v: RenderGradient) -> RenderGradient:
     v_d, v_encoding = v_inputs[:, :3], np.ascontiguousarray(v_inputs[:, 3:])
     scaled = (g.means - shared[CENTER]) / shared[RADIUS]
     places = (contract(scaled) + 2) / 4
-    v_table, v_places = tape.networks.hash_grid_vjp(shared[TABLE], places, levels_of(shared[TABLE]), v_encoding)
+    v_table, v_places = tape.networks.hash_grid_vjp(shared[TABLE], places, find_levels(shared[TABLE]), v_encoding)
     v_means, v_R, v_t = directions_vjp(tape.d, tape.distances, tape.camera, v_d)
     v_means = v_means + contract_vjp(scaled, v_places / 4) / shared[RADIUS]
     return v._replace(
@@ -275,7 +275,7 @@ def render_modulated(
     if TABLE not in model.shared or not len(model.gaussians.means):
         output, inner = SPLATTING.render(model, view, request)
         return output, (inner, None)
-    seen, tape = as_seen(model, view.camera, modulation(), networks_for(request.backend))
+    seen, tape = modulate_model(model, view.camera, modulation(), networks_for(request.backend))
     output, inner = SPLATTING.render(model._replace(gaussians=seen), view, request)
     return output, (inner, tape)
 
@@ -284,7 +284,7 @@ def render_modulated_vjp(tapes: tuple[Any, Tape | None], v_image: Floats, v_alph
     """Gradient of :func:`render_modulated`: that of 3DGS, carried on to the network."""
     inner, tape = tapes
     v = SPLATTING.render_vjp(inner, v_image, v_alpha)
-    return v if tape is None else as_seen_vjp(tape, v)
+    return v if tape is None else modulate_model_vjp(tape, v)
 
 
 VIEW_DEPENDENT = Representation(
@@ -345,7 +345,7 @@ def _sides(tape: Tape) -> tuple[Any, ...]:
     """Return the ReLUs that are on, the cells of the grid, and which opacities are at no bound."""
     means, shared = tape.model.gaussians.means, tape.model.shared
     places = (contract((means - shared[CENTER]) / shared[RADIUS]) + 2) / 4
-    cells = [np.floor(places * n) for n in levels_of(shared[TABLE]).resolutions]
+    cells = [np.floor(places * n) for n in find_levels(shared[TABLE]).resolutions]
     bounds = () if tape.opacities is None else (tape.opacities.is_free,)
-    hidden = as_seen(tape.model, tape.camera, tape.mode, IN_NUMPY)[1].inputs[1]  # kernels keep them otherwise
+    hidden = modulate_model(tape.model, tape.camera, tape.mode, IN_NUMPY)[1].inputs[1]  # kernels keep them otherwise
     return (hidden > 0, *cells, *bounds)

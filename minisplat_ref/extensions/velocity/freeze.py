@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.extensions.velocity.model import MovingGaussians, still_at
+from minisplat_ref.extensions.velocity.model import MovingGaussians, freeze_gaussians
 from minisplat_ref.io.ply import load_ply, save_ply
 
 
@@ -23,7 +23,7 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Move the Gaussians to where they are at that time, and write them without velocities."""
-    still = still_at(load_ply(args.ply, MovingGaussians), args.time)
+    still = freeze_gaussians(load_ply(args.ply, MovingGaussians), args.time)
     save_ply(args.out, still)
     print(f"{len(still.means):,} Gaussians at time {args.time:g} in {args.out}")
     return 0

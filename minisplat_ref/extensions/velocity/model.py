@@ -31,7 +31,7 @@ def at_rest(gaussians: Gaussians, rng: np.random.Generator) -> MovingGaussians:
     return MovingGaussians(**gaussians._asdict(), velocities=np.zeros_like(gaussians.means))
 
 
-def means_at(means: Floats, velocities: Floats, time: float) -> Floats:
+def move_means(means: Floats, velocities: Floats, time: float) -> Floats:
     """Return the centres at a time: ``mu(t) = mu + t nu``.
 
     Parameters
@@ -51,8 +51,8 @@ def means_at(means: Floats, velocities: Floats, time: float) -> Floats:
     return means + means.dtype.type(time) * velocities
 
 
-def means_at_vjp(time: float, v_means_at: Floats) -> tuple[Floats, Floats]:
-    """Gradient of :func:`means_at` with respect to means and velocities.
+def move_means_vjp(time: float, v_means_at: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`move_means` with respect to means and velocities.
 
     ::
 
@@ -72,20 +72,20 @@ def means_at_vjp(time: float, v_means_at: Floats) -> tuple[Floats, Floats]:
     return v_means_at, v_means_at.dtype.type(time) * v_means_at
 
 
-def still_at(moving: MovingGaussians, time: float) -> Gaussians:
+def freeze_gaussians(moving: MovingGaussians, time: float) -> Gaussians:
     """Return the Gaussians of 3DGS at the places of these at a time."""
     still = Gaussians(*(getattr(moving, name) for name in Gaussians._fields))
-    return still._replace(means=means_at(moving.means, moving.velocities, time))
+    return still._replace(means=move_means(moving.means, moving.velocities, time))
 
 
 def _hold_still(model: Model, view: View, request: Request) -> tuple[Inputs, float]:
     """Return the inputs with the Gaussians at the time of the view, and that time."""
-    return (model._replace(gaussians=still_at(model.gaussians, view.time)), view, request), view.time
+    return (model._replace(gaussians=freeze_gaussians(model.gaussians, view.time)), view, request), view.time
 
 
 def _hold_still_vjp(time: float, v: RenderGradient) -> RenderGradient:
     """Gradient of :func:`_hold_still`: that of the means reaches the velocities, too."""
-    v_means, v_velocities = means_at_vjp(time, v.gaussians.means)
+    v_means, v_velocities = move_means_vjp(time, v.gaussians.means)
     v_still = v.gaussians._replace(means=v_means)
     return v._replace(gaussians=MovingGaussians(**v_still._asdict(), velocities=v_velocities))
 

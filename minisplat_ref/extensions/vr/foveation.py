@@ -182,7 +182,7 @@ def bin_zones(footprints: TangentFootprints, samplings: Sequence[Sampling]) -> l
     The lists suffice for rendering, not for differentiating.
     """
     offsets = np.cumsum([0, *(len(sampling.is_needed) for sampling in samplings)])  # of a zone's tiles among all
-    pairs = [_pairs_of(footprints.boxes, sampling) for sampling in samplings]
+    pairs = [_list_pairs(footprints.boxes, sampling) for sampling in samplings]
     ids = np.concatenate([of_zone[0] for of_zone in pairs])
     tiles = np.concatenate([of_zone[1] + offset for of_zone, offset in zip(pairs, offsets, strict=False)])
     order = np.lexsort((ids, footprints.distances[ids], tiles))
@@ -198,9 +198,9 @@ def bin_zones(footprints: TangentFootprints, samplings: Sequence[Sampling]) -> l
     return lists
 
 
-def _pairs_of(boxes: Ints, sampling: Sampling) -> tuple[Ints, Ints]:
+def _list_pairs(boxes: Ints, sampling: Sampling) -> tuple[Ints, Ints]:
     """Return Gaussian and tile of each pair [M] of a zone, for the tiles that are needed."""
-    grid, (x0, y0, x1, y1) = sampling.grid, _in_blocks(boxes, sampling).astype(np.int64).T
+    grid, (x0, y0, x1, y1) = sampling.grid, _convert_boxes(boxes, sampling).astype(np.int64).T
     left, top = x0 // grid.tile_width, y0 // grid.tile_height
     right, bottom = -(-x1 // grid.tile_width), -(-y1 // grid.tile_height)
     needed = sampling.is_needed.reshape(grid.n_tiles_y, grid.n_tiles_x)
@@ -216,7 +216,7 @@ def _pairs_of(boxes: Ints, sampling: Sampling) -> tuple[Ints, Ints]:
     return rows[of_row[is_kept]], tiles[is_kept]
 
 
-def _in_blocks(boxes: Ints, sampling: Sampling) -> Ints:
+def _convert_boxes(boxes: Ints, sampling: Sampling) -> Ints:
     """Return boxes of pixels as boxes [N, 4] of the blocks that they touch, in the zone's image."""
     block, size = sampling.block, np.array(2 * [sampling.grid.width, sampling.grid.height])
     touched = np.concatenate([boxes[:, :2] // block, -(-boxes[:, 2:] // block)], axis=1)
@@ -227,7 +227,7 @@ def _render_zone(prepared: Prepared, sampling: Sampling, bins: TileBins) -> Floa
     """Return the image [H, W, 3] of a zone; Gaussians that are not listed there are not even read."""
     rows = np.unique(bins.gaussian_ids)
     fields = {name: field[rows] for name, field in prepared.footprints._asdict().items() if name != "camera"}
-    fields["boxes"] = _in_blocks(fields["boxes"], sampling)
+    fields["boxes"] = _convert_boxes(fields["boxes"], sampling)
     listed = prepared._replace(
         footprints=TangentFootprints(**fields, camera=sampling.camera), channels=prepared.channels[rows]
     )
