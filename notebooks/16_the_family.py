@@ -40,7 +40,7 @@ from data_tools.claims.proxies.affine import camera as card_camera
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, draw_ellipses, show
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.antialiasing.reference import smooth
+from minisplat_ref.extensions.antialiasing.model import smooth
 from minisplat_ref.extensions.compression.lattice import from_lattice, to_lattice
 from minisplat_ref.extensions.compression.levels import exponents
 from minisplat_ref.extensions.compression.msz import CONTAINER, decode, encode

@@ -42,10 +42,9 @@ from data_tools.claims.rays.demo import ball as ball_of_discs
 from data_tools.claims.textured import colors_across
 from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.analytic.reference import NORMAL, integrals
-from minisplat_ref.extensions.cuts.curve import VERTICES, evaluate_cuts
-from minisplat_ref.extensions.fans.method import render as render_fans
-from minisplat_ref.extensions.fans.shapes import FanShape, convert_gaussians, mesh_of
+from minisplat_ref.extensions.analytic.response import NORMAL, integrals
+from minisplat_ref.extensions.cuts.response import VERTICES, evaluate_cuts
+from minisplat_ref.extensions.fans.model import FanShape, convert_gaussians, mesh_of, render_fans
 from minisplat_ref.extensions.mixed import response as hull_response
 from minisplat_ref.extensions.polygons.soup import make_soup
 from minisplat_ref.extensions.textured.model import add_textures, frames, meet

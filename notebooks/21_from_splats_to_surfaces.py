@@ -31,7 +31,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
-from minisplat_ref.extensions.gdgs.reference import contract, disperse
+from minisplat_ref.extensions.gdgs.model import contract, disperse
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.fusion.extraction import extract
 from minisplat_ref.mechanisms.fusion.reference import fuse

@@ -34,7 +34,7 @@ from data_tools.claims.wave import measures as claims
 from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.lens.method import THROUGH_LENS
+from minisplat_ref.extensions.lens.model import THROUGH_LENS
 from minisplat_ref.extensions.wave.blending import Scene, blend
 from minisplat_ref.extensions.wave.model import propagate
 from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, number, seed
 from data_tools.claims.kit.figures import set_ticks
-from minisplat_ref.extensions.analytic.reference import EXACT_RESPONSE, LOGISTIC, NORMAL, RESPONSE, integrals
+from minisplat_ref.extensions.analytic.response import EXACT_RESPONSE, LOGISTIC, NORMAL, RESPONSE, integrals
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.reference.antialiasing import compensations

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, downscale, iterations, scene, seeds
 from data_tools.claims.kit.figures import plot_band, show, with_deviation
-from minisplat_ref.extensions.antialiasing.method import apply_filters, with_2d_filter, with_3d_filter
+from minisplat_ref.extensions.antialiasing.model import apply_filters, with_2d_filter, with_3d_filter
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table

@@ -21,9 +21,16 @@ from data_tools.claims.kit.claim import OUT, declare, iterations, seeds
 from data_tools.claims.kit.figures import show, subplots
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic.cameras import look_at
-from minisplat_ref.extensions.discretized_sdf.losses import projection
-from minisplat_ref.extensions.discretized_sdf.population import WIDTH, SDFSurfels, facing, with_distances
-from minisplat_ref.extensions.discretized_sdf.reference import opacity_logits, projected, reference_sharpness
+from minisplat_ref.extensions.discretized_sdf.model import (
+    WIDTH,
+    SDFSurfels,
+    facing,
+    opacity_logits,
+    projected,
+    reference_sharpness,
+    with_distances,
+)
+from minisplat_ref.extensions.discretized_sdf.recipe import projection
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT

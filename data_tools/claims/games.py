@@ -19,7 +19,7 @@ from data_tools.claims.kit.figures import bars, group
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.games.method import GAMES, on_faces
+from minisplat_ref.extensions.games.model import GAMES, on_faces
 from minisplat_ref.interface.palette import BLUE, GREY
 from minisplat_ref.mechanisms.fusion.extraction import extract
 from minisplat_ref.mechanisms.fusion.kernels import fuse

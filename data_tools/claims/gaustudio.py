@@ -22,9 +22,11 @@ from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.gaustudio.losses import sky_opacity
-from minisplat_ref.extensions.gaustudio.modules import all_stages
-from minisplat_ref.extensions.gaustudio.sky_masks import by_color, from_files
+from minisplat_ref.extensions.gaustudio.alternatives import by_color, from_files
+from minisplat_ref.extensions.gaustudio.commands import all_stages
+from minisplat_ref.extensions.gaustudio.model import sky_opacity
+from minisplat_ref.interface.palette import BLUE, GREY
+from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.recipe_settings import configure, parse_settings
 from minisplat_ref.training.schedule import Recipe

@@ -14,9 +14,8 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.analytic.gradient_checks import stages
-from minisplat_ref.extensions.analytic.method import INTEGRATED
-from minisplat_ref.extensions.analytic.reference import (
+from minisplat_ref.extensions.analytic.model import INTEGRATED, stages
+from minisplat_ref.extensions.analytic.response import (
     EXACT_RESPONSE,
     LOGISTIC,
     NORMAL,
@@ -163,7 +162,7 @@ def test_the_gradient_of_the_whole_model(backend, small_proof):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch, small_proof):
-    path = "minisplat_ref.extensions.analytic.reference.axes_of_vjp"
+    path = "minisplat_ref.extensions.analytic.response.axes_of_vjp"
     monkeypatch.setattr(path, lambda conics, axes, v_axes: 1.001 * axes_of_vjp(conics, axes, v_axes))
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, INTEGRATED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note

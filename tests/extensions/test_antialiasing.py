@@ -15,7 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.antialiasing.method import (
+from minisplat_ref.extensions.antialiasing.model import (
     ANTIALIASING,
     EPS2D,
     FILTERED,
@@ -26,9 +26,10 @@ from minisplat_ref.extensions.antialiasing.method import (
     measure_filters,
     reset_smoothed_opacity,
     reset_smoothed_opacity_on_white,
+    smooth,
+    smooth_vjp,
     with_3d_filter,
 )
-from minisplat_ref.extensions.antialiasing.reference import smooth, smooth_vjp
 from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms import sampling
 from minisplat_ref.mechanisms.sampling import sampling_intervals, shrink_photographs

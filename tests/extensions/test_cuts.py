@@ -14,17 +14,18 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.cuts.curve import (
+from minisplat_ref.extensions.cuts.model import CUT_GAUSSIANS, CutGaussians, with_cuts
+from minisplat_ref.extensions.cuts.response import (
     N_EDGES,
     N_PIECES,
     VERTICES,
     bernstein,
+    count_crossings,
     evaluate_cuts,
     evaluate_cuts_vjp,
-    n_crossings,
+    image_points,
+    image_points_vjp,
 )
-from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
-from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
 from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
@@ -65,8 +66,8 @@ def test_a_closed_curve_cuts_as_a_point_in_a_polygon(rng):
     points = np.array([[[3.0, 0.0], [9.0, -7.0], [9.0, 7.0], [3.0, 0.0]]])
     polygon, d = Polygon(VERTICES @ points[0]), rng.uniform(-9, 9, size=(1, 4000, 2))
     inside = polygon.contains_points(d[0])
-    assert inside.sum() > 50 and (n_crossings(points, d)[0] % 2 == 1)[inside].all()
-    assert (n_crossings(points, d)[0] % 2 == 0)[~inside].all()
+    assert inside.sum() > 50 and (count_crossings(points, d)[0] % 2 == 1)[inside].all()
+    assert (count_crossings(points, d)[0] % 2 == 0)[~inside].all()
 
 
 def test_the_polygon_is_the_curve_at_its_vertices():
@@ -122,7 +123,7 @@ def test_where_two_shadows_overlap_it_is_visible_again():
     found = evaluate_cuts(both, HARD, d)
     is_cut = [one.masks == 0 for one in alone]
     assert (is_cut[0] & is_cut[1]).sum() > 20 and (found.masks == (is_cut[0] == is_cut[1])).all()
-    assert_array_equal(n_crossings(both, d), n_crossings(LOOP, d) + n_crossings(AROUND, d))
+    assert_array_equal(count_crossings(both, d), count_crossings(LOOP, d) + count_crossings(AROUND, d))
 
 
 def test_the_soft_mask_of_two_curves_is_that_of_the_nearer():

@@ -9,20 +9,23 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.discretized_sdf import EXTENSION, losses, population
-from minisplat_ref.extensions.discretized_sdf.method import (
+from minisplat_ref.extensions.discretized_sdf import EXTENSION, recipe
+from minisplat_ref.extensions.discretized_sdf.model import (
     DISTANCED,
-    RECIPE,
-    refresh_opacities,
-    reset_distances,
-    reset_distances_on_white,
-)
-from minisplat_ref.extensions.discretized_sdf.population import LOG_WIDTH, WIDTH, with_distances
-from minisplat_ref.extensions.discretized_sdf.reference import (
+    LOG_WIDTH,
+    WIDTH,
+    _foreground,
     opacity_logits,
     opacity_logits_vjp,
     projected,
     reference_sharpness,
+    with_distances,
+)
+from minisplat_ref.extensions.discretized_sdf.recipe import (
+    RECIPE,
+    refresh_opacities,
+    reset_distances,
+    reset_distances_on_white,
 )
 from minisplat_ref.io.frames import place_fields
 from minisplat_ref.io.images import read_image
@@ -110,7 +113,7 @@ def test_a_start_on_the_sphere(rng):
     assert (found.distances > 0).any() and (found.distances < 0).any()
     none = with_distances(gaussians, rng, foreground=0.0)
     assert_array_equal(none.means, gaussians.means)
-    rows, _, _ = population._foreground(gaussians.means[:7], 0.4)
+    rows, _, _ = _foreground(gaussians.means[:7], 0.4)
     assert len(rows) == 3  # of 2.8
 
 
@@ -131,50 +134,50 @@ def rendered_of(means, distances, depth=2.0, width=8, height=6, **changed):
 def test_the_projection_by_hand():
     """Depths of the projected centres 2.03, 1.96 and 2.2; the last is too far, one is beside the image, one behind."""
     means = [[0, 0, 2.13], [0.1, 0, 1.9], [0, 0.1, 2.2], [9, 0, 2.0], [0, 0, -2.0]]
-    value, v = losses.projection(rendered_of(means, [0.1, -0.06, 0, 0, 0]), reach=0.1)
+    value, v = recipe.projection(rendered_of(means, [0.1, -0.06, 0, 0, 0]), reach=0.1)
     assert_allclose(value, (0.03 + 0.04) / 2, rtol=1e-9)
     assert_allclose(v.gaussians["means"][:, 2], [0.5, -0.5, 0, 0, 0])
     assert_allclose(v.gaussians["distances"], [-0.5, 0.5, 0, 0, 0])
     assert not v.gaussians["quats"][2:].any()
     near = rendered_of([[0, 0, 0.009], [0, 0, 0.011]], [0.0, 0.0], depth=0.05)  # what touches the camera has no pixel
-    assert_allclose(losses.rendered_depths(near), [0, 0.05], rtol=1e-6)
-    nothing, v = losses.projection(rendered_of(means[3:], [0.0, 0.0]), reach=0.1)
+    assert_allclose(recipe.rendered_depths(near), [0, 0.05], rtol=1e-6)
+    nothing, v = recipe.projection(rendered_of(means[3:], [0.0, 0.0]), reach=0.1)
     assert nothing == 0 and not v.gaussians
 
 
 def test_the_projection_holds_the_rendered_depth():
     rendered = rendered_of([[0, 0, 2.0]], [0.0], 2.05)
     moved = rendered_of([[0, 0, 2.0]], [0.0], 2.01)._replace(held=rendered)
-    assert_allclose(losses.projection(moved, reach=0.1)[0], 0.05, rtol=1e-9)
+    assert_allclose(recipe.projection(moved, reach=0.1)[0], 0.05, rtol=1e-9)
 
 
 def test_the_median_by_hand():
     s = [0.1, -0.3, 0.2]
     assert_allclose(reference_sharpness(np.array(s)), 1.7627471740390859 / 0.2, rtol=1e-12)
-    value, v = losses.median(rendered_of(np.zeros((3, 3)), s))
+    value, v = recipe.median(rendered_of(np.zeros((3, 3)), s))
     assert_allclose(value, 1.7627471740390859 / 0.2 - 2, rtol=1e-12)
     assert_allclose(v.shared[LOG_WIDTH], [2.0])
     sharp = rendered_of(
         np.zeros((3, 3)), s, model=Model(rendered_of(np.zeros((3, 3)), s).model.gaussians, shared_of(0.1))
     )
-    assert losses.median(sharp)[0] == 0
-    assert losses.median(rendered_of(np.zeros((3, 3)), [0.0, 0.0, 0.0]))[0] == 0
+    assert recipe.median(sharp)[0] == 0
+    assert recipe.median(rendered_of(np.zeros((3, 3)), [0.0, 0.0, 0.0]))[0] == 0
     [term] = [term for term in RECIPE.losses if term.name == "median"]
     assert not term.is_due(1_000) and term.is_due(1_001) and term.weight == 100
 
 
 def test_the_silhouette_by_hand():
     rendered = rendered_of(np.zeros((1, 3)), [0.0])
-    assert losses.silhouette(rendered)[0] == 0
+    assert recipe.silhouette(rendered)[0] == 0
     mask = np.zeros((6, 8), bool)
     mask[:, :4] = True
     alpha = np.where(mask, 0.9, 0.2)
     masked = rendered._replace(view=rendered.view._replace(mask=mask), output=rendered.output._replace(alpha=alpha))
-    value, v = losses.silhouette(masked)
+    value, v = recipe.silhouette(masked)
     assert_allclose(value, -(np.log(0.9) + np.log(0.8)) / 2, rtol=1e-12)
     assert_allclose(v.alpha[0, [0, 7]], [-1 / 0.9 / 48, 1 / 0.8 / 48], rtol=1e-12)
     thin = masked._replace(output=rendered.output._replace(alpha=np.where(mask, 1.0, 1e-5)))
-    value, v = losses.silhouette(thin)  # beyond the margin of 1e-6 there is neither an infinite loss nor a slope
+    value, v = recipe.silhouette(thin)  # beyond the margin of 1e-6 there is neither an infinite loss nor a slope
     assert_allclose(value, -(np.log(1 - 1e-6) + np.log(1 - 1e-5)) / 2, rtol=1e-6)
     assert v.alpha[0, 0] == 0 and v.alpha[0, 7] > 0
 

@@ -8,7 +8,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
-from data_tools.claims.fans.profile import fan_profile
+from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.fans.profile import fan_profile, mass, profile_error
+from data_tools.claims.fans.shape_search import alpha_of, best_shape, render_clipped
 from gltf import glb_parts, only_primitive, values
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
@@ -16,20 +18,23 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.fans.gradient_checks import stages
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans, write_mesh
-from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, keep_in_range, prune_faint_fans, render, render_vjp
-from minisplat_ref.extensions.fans.shapes import (
+from minisplat_ref.extensions.fans.model import (
+    FANS_OF_GAUSSIANS,
     Fans,
     FanShape,
     convert_gaussians,
+    keep_in_range,
     mesh_of,
     mesh_of_vjp,
+    prune_faint_fans,
+    render_fans,
+    render_fans_vjp,
+    stages,
     table,
     vertices_of,
     visible_mesh,
 )
-from minisplat_ref.extensions.fans.tuning import alpha_of, best_shape, render_clipped
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.gbuffer.tone import tone
 from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh
@@ -61,9 +66,9 @@ def fans_of(rng, n, shape=FLAT, dtype=np.float64):
 def pieces(rng, n, shape, backend, dtype=np.float64):
     """An image of fans, and its gradient for random cotangents."""
     fans, view = fans_of(rng, n, shape, dtype), view_from(make_camera(rng=rng))
-    output, tape = render(Model(fans), view, Request(np.full(3, 0.3), backend=backend))
+    output, tape = render_fans(Model(fans), view, Request(np.full(3, 0.3), backend=backend))
     v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
-    return output, render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
+    return output, render_fans_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
 
 
 # --- shapes ---
@@ -182,9 +187,9 @@ def test_kernels_are_the_reference(shape):
 def test_the_gradient_of_projected_centres_moves_a_whole_fan(axis, rng):
     fans, camera = fans_of(rng, 3), make_camera(rng=rng)
     view, request, step = view_from(camera), Request(backend=REFERENCE), 1e-5
-    output, tape = render(Model(fans), view, request)
+    output, tape = render_fans(Model(fans), view, request)
     v_image = rng.normal(size=output.image.shape)
-    v = render_vjp(tape, v_image).means2d
+    v = render_fans_vjp(tape, v_image).means2d
     z = fans.means @ camera.cam_from_world_R[2] + camera.cam_from_world_t[2]
     per_pixel = camera.cam_from_world_R[axis] * z[1] / (camera.fx, camera.fy)[axis]  # world units of fan 1
 
@@ -192,7 +197,7 @@ def test_the_gradient_of_projected_centres_moves_a_whole_fan(axis, rng):
         means, rims = fans.means.copy(), fans.rims.copy()
         means[1] += shift * per_pixel
         rims[1] += shift * per_pixel
-        return np.vdot(render(Model(fans._replace(means=means, rims=rims)), view, request)[0].image, v_image)
+        return np.vdot(render_fans(Model(fans._replace(means=means, rims=rims)), view, request)[0].image, v_image)
 
     assert abs(v[1, axis]) > 1e-2
     assert (loss(step) - loss(-step)) / (2 * step) == pytest.approx(v[1, axis], rel=1e-4)
@@ -201,20 +206,20 @@ def test_the_gradient_of_projected_centres_moves_a_whole_fan(axis, rng):
 def test_rows_that_are_not_drawn(backend, rng):
     fans, view = fans_of(rng, 9), view_from(make_camera())
     is_visible = np.arange(9) % 2 == 0
-    some, tape = render(Model(fans), view, Request(backend=backend, is_visible=is_visible))
-    alone, _ = render(Model(Fans._make(f[is_visible] for f in fans)), view, Request(backend=backend))
+    some, tape = render_fans(Model(fans), view, Request(backend=backend, is_visible=is_visible))
+    alone, _ = render_fans(Model(Fans._make(f[is_visible] for f in fans)), view, Request(backend=backend))
     assert_array_equal(some.image, alone.image)
     assert set(some.visible_ids) <= {0, 2, 4, 6, 8} and len(some.visible_ids) == len(alone.visible_ids) > 2
-    v = render_vjp(tape, np.ones_like(some.image))
+    v = render_fans_vjp(tape, np.ones_like(some.image))
     assert not v.gaussians.rims[1::2].any() and v.gaussians.rims[0].any()
 
 
 def test_what_is_not_drawn_is_refused(rng):
     model, view = Model(fans_of(rng, 2)), view_from(make_camera())
     with pytest.raises(InputError, match="without depth"):
-        render(model, view, Request(wants=frozenset({"depth"})))
+        render_fans(model, view, Request(wants=frozenset({"depth"})))
     with pytest.raises(InputError, match="max_layers is 0"):
-        render(model, view, Request(), max_layers=0)
+        render_fans(model, view, Request(), max_layers=0)
 
 
 # --- training ---
@@ -443,6 +448,27 @@ def test_models_that_hold_nothing_are_refused(model, scene_folder, tmp_path, cap
     with pytest.raises(SystemExit, match="2"):
         main([*tune, str(out), "--iterations", "0"])
     assert "--iterations" in capsys.readouterr().err
+
+
+def test_the_studies(scene_folder, model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("data_tools.claims.fans.measures.REACHES", (2.5,))
+    monkeypatch.setattr("data_tools.claims.fans.measures.SIDES", (4, 8))
+    monkeypatch.setattr("data_tools.claims.fans.measures.VIEWS_MAX", 1)
+    monkeypatch.setattr("data_tools.claims.fans.shape_search.EVALUATIONS", 4)
+    monkeypatch.setattr("data_tools.claims.fans.shape_search.FIRST_REACHES", (2.5,))
+    monkeypatch.setattr("data_tools.claims.fans.profile.ANGLES", (0, 90))
+    refit, profile = tmp_path / "refit", tmp_path / "profile"
+    options = ["--ply", str(model), "--fine-tune", "3", "--out", str(refit)]
+    assert measure_claim(["fans/refit", str(scene_folder), *options]) == 0
+    (run,) = json.loads((refit / "result.json").read_text())["runs"]
+    assert [row["form"] for row in run["rows"] if "triangles" in row][::3] == ["flat fans", "solid fans"]
+    assert (refit / "figure.png").stat().st_size > 10_000 and "| flat fans, vertices" in capsys.readouterr().out
+    assert sorted(path.name for path in refit.iterdir()) == ["figure.png", "result.json"]
+    assert measure_claim(["fans/profile", "--out", str(profile)]) == 0
+    tilts = json.loads((profile / "result.json").read_text())["tilts"]
+    edge_on = {(tilt["kind"], tilt["is_flat"]): tilt["errors"][1] for tilt in tilts}
+    assert edge_on["ball", True] > 0.99 > edge_on["ball", False]
+    assert "| 8     | 2.50  | 0.00 | 12.3%     | 0.94 |" in capsys.readouterr().out
 
 
 def test_fans_of_sparse_points_face_everywhere(rng):

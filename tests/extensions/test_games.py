@@ -8,8 +8,16 @@ from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions.games.faces import FaceGaussians, face_frames, on_own_faces, place, place_vjp
-from minisplat_ref.extensions.games.method import ON_FACES, from_mesh, on_faces
+from minisplat_ref.extensions.games.model import (
+    ON_FACES,
+    FaceGaussians,
+    face_frames,
+    from_mesh,
+    on_faces,
+    on_own_faces,
+    place,
+    place_vjp,
+)
 from minisplat_ref.io.frames import place_scene, return_population
 from minisplat_ref.io.ply import load_ply, read_label
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, save_mesh

@@ -10,19 +10,22 @@ from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.gaustudio import backgrounds, densities, initialisers, losses, representations, sky_masks
-from minisplat_ref.extensions.gaustudio.backgrounds import BALL, MAP, white_ball, with_light
-from minisplat_ref.extensions.gaustudio.modules import all_stages
-from minisplat_ref.extensions.gaustudio.reference import (
+from minisplat_ref.extensions.gaustudio import alternatives, backgrounds
+from minisplat_ref.extensions.gaustudio.backgrounds import (
+    BALL,
+    MAP,
     ball_gaussians,
     fibonacci_directions,
     find_texels,
     look_up,
     look_up_vjp,
-    opacity_in,
     put_behind,
     put_behind_vjp,
+    white_ball,
+    with_light,
 )
+from minisplat_ref.extensions.gaustudio.commands import all_stages
+from minisplat_ref.extensions.gaustudio.model import mean_opacity, sky_opacity
 from minisplat_ref.io.images import write_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
@@ -123,11 +126,11 @@ def test_light_behind_by_hand_and_by_differences(rng):
 
 def test_opacity_in_a_mask_by_hand():
     alpha = np.array([[0.5, 0.25], [1.0, 0.0]])
-    value, v = opacity_in(alpha, np.array([[True, True], [False, False]]))
+    value, v = mean_opacity(alpha, np.array([[True, True], [False, False]]))
     assert value == 0.375 and v.tolist() == [[0.5, 0.5], [0, 0]]
-    value, v = opacity_in(alpha, np.array([[True, True], [True, False]]))
+    value, v = mean_opacity(alpha, np.array([[True, True], [True, False]]))
     assert value == pytest.approx(1.75 / 3) and v.tolist() == [[1 / 3, 1 / 3], [1 / 3, 0]]
-    value, v = opacity_in(alpha, np.zeros((2, 2), bool))
+    value, v = mean_opacity(alpha, np.zeros((2, 2), bool))
     assert value == 0 and not v.any()
 
 
@@ -155,7 +158,7 @@ def test_light_has_no_parallax_and_depths_stay(rng, light):
     camera = make_camera(rng=rng)
     sky = white_ball(300).astype(float) if light is BALL else rng.uniform(size=(6, 9, 3))
     moved = camera._replace(cam_from_world_t=camera.cam_from_world_t + 5)
-    images = [light.draw(sky, c, Request(BACKGROUND))[0] for c in (camera, moved)]
+    images = [light.render(sky, c, Request(BACKGROUND))[0] for c in (camera, moved)]
     assert_array_equal(*images)
     g, view, depth = make_gaussians(rng, 12), view_from(camera), Request(BACKGROUND, wants=frozenset({"depth"}))
     plain = SPLATTING.render(Model(g), view, depth._replace(background=None))[0]
@@ -243,10 +246,10 @@ def test_the_squared_loss_by_hand():
     """Two pixels differ by 1/5 and 2/5 in all channels; then the mask leaves the first alone."""
     view = photograph(np.array([[[51] * 3, [102] * 3]]))
     output = RenderOutput(np.zeros((1, 2, 3)), np.zeros((1, 2)), None, None)
-    value, v = losses.squared(rendered(view, output))
+    value, v = alternatives.squared(rendered(view, output))
     assert_allclose(value, (0.04 + 0.16) / 2, rtol=CLOSED_FORM)
     assert_allclose(v.channels["rgb"][0, :, 0], [2 * -0.2 / 6, 2 * -0.4 / 6], rtol=CLOSED_FORM)
-    value, v = losses.squared(rendered(view._replace(mask=np.array([[True, False]])), output))
+    value, v = alternatives.squared(rendered(view._replace(mask=np.array([[True, False]])), output))
     assert_allclose(value, 0.04, rtol=CLOSED_FORM)
     assert_allclose(v.channels["rgb"][0, :, 0], [2 * -0.2 / 3, 0], atol=1e-15)
 
@@ -255,8 +258,8 @@ def test_the_other_losses_are_those_of_3dgs(rng):
     view = photograph(rng.integers(0, 256, (12, 13, 3)))
     output = RenderOutput(rng.uniform(size=(12, 13, 3)), np.zeros((12, 13)), None, None)
     given = rendered(view, output)
-    assert losses.l1_and_dssim(given)[0] == photometric(given, dssim_weight=0.2)[0]
-    assert_allclose(losses.l1(given)[0], np.abs(output.image - view.image / 255).mean(), rtol=1e-6)
+    assert alternatives.l1_and_dssim(given)[0] == photometric(given, dssim_weight=0.2)[0]
+    assert_allclose(alternatives.l1(given)[0], np.abs(output.image - view.image / 255).mean(), rtol=1e-6)
 
 
 SKY_BLUE, CLOUD, ROAD, ROOF = (90, 140, 210), (240, 236, 230), (150, 150, 155), (60, 40, 40)
@@ -271,42 +274,40 @@ def test_the_rule_on_colours_by_hand():
             [ROOF, ROOF, ROOF, SKY_BLUE, ROAD],
         ]
     )
-    found = sky_masks.by_color(photograph(image), "")
+    found = alternatives.by_color(photograph(image), "")
     assert_array_equal(found, [[1, 1, 1, 0, 0], [1, 0, 1, 0, 0], [0, 0, 0, 0, 0]])
-    assert not sky_masks.by_color(photograph(np.tile(np.array(ROOF), (2, 2, 1))), "").any()
+    assert not alternatives.by_color(photograph(np.tile(np.array(ROOF), (2, 2, 1))), "").any()
     lawn, bright_lamp = (90, 220, 200), (255, 235, 90)  # more green than blue; bright in two channels
-    assert not sky_masks.by_color(photograph(np.array([[lawn, bright_lamp]])), "").any()
+    assert not alternatives.by_color(photograph(np.array([[lawn, bright_lamp]])), "").any()
 
 
 def test_masks_of_the_photograph_and_of_files(tmp_path):
     mask = np.array([[True, False, True, True], [True, True, True, False]])
     view = photograph(np.zeros((2, 4, 3)), mask)
-    assert_array_equal(sky_masks.left_out(view, ""), ~mask)
-    assert sky_masks.left_out(view._replace(mask=None), "") is None
+    assert_array_equal(alternatives.left_out(view, ""), ~mask)
+    assert alternatives.left_out(view._replace(mask=None), "") is None
     large = np.repeat(np.repeat(mask, 4, axis=0), 4, axis=1)
     write_image(tmp_path / "a.png", large)
-    assert_array_equal(sky_masks.from_files(view, str(tmp_path)), mask)
+    assert_array_equal(alternatives.from_files(view, str(tmp_path)), mask)
     with pytest.raises(InputError, match="sky_mask=from_files has no folder to read: add --set mask_folder=DIR"):
-        sky_masks.from_files(view, "")
+        alternatives.from_files(view, "")
     with pytest.raises(InputError, match=r"b\.png: there is no such mask; minisplat-ref gaustudio masks SCENE"):
-        sky_masks.from_files(view._replace(name="b"), str(tmp_path))
+        alternatives.from_files(view._replace(name="b"), str(tmp_path))
     write_image(tmp_path / "d.png", np.tile(mask, (25, 26))[:, :103])
     with pytest.raises(InputError, match=r"d\.png has 103 x 50 pixels"):  # 3 % wider than the photograph
-        sky_masks.from_files(view._replace(name="d"), str(tmp_path))
+        alternatives.from_files(view._replace(name="d"), str(tmp_path))
     write_image(tmp_path / "c.png", large[:4])
     with pytest.raises(InputError, match=r"c\.png has 16 x 4 pixels, which is not the shape of the photograph, 4 x 2"):
-        sky_masks.from_files(view._replace(name="c"), str(tmp_path))
+        alternatives.from_files(view._replace(name="c"), str(tmp_path))
 
 
 def test_the_sky_term_counts_alpha_where_the_mask_says():
     alpha = np.array([[0.5, 0.25], [1.0, 0.0]])
     output = RenderOutput(np.zeros((2, 2, 3)), alpha, None, None)
     view = photograph(np.zeros((2, 2, 3)), np.array([[False, True], [True, False]]))
-    value, v = losses.sky_opacity(rendered(view, output), sky_mask=sky_masks.left_out, mask_folder="")
+    value, v = sky_opacity(rendered(view, output), sky_mask=alternatives.left_out, mask_folder="")
     assert value == 0.25 and v.alpha.tolist() == [[0.5, 0], [0, 0.5]]
-    value, v = losses.sky_opacity(
-        rendered(view._replace(mask=None), output), sky_mask=sky_masks.left_out, mask_folder=""
-    )
+    value, v = sky_opacity(rendered(view._replace(mask=None), output), sky_mask=alternatives.left_out, mask_folder="")
     assert value == 0 and v.alpha is None
 
 
@@ -315,32 +316,32 @@ def test_the_sky_term_counts_alpha_where_the_mask_says():
 
 def test_initialisers(scene, rng, monkeypatch):
     g = make_gaussians(rng, 30)._replace(log_scales=np.full((30, 3), -1.0))
-    assert initialisers.points(g, scene, rng) is None
-    flat = initialisers.planes(g, scene, rng)
+    assert alternatives.points(g, scene, rng) is None
+    flat = alternatives.planes(g, scene, rng)
     assert_array_equal(flat.means, g.means)
     assert_allclose(flat.log_scales - g.log_scales, np.tile((0, 0, np.log(0.3)), (30, 1)), atol=1e-15)
-    boxed = initialisers.box(g, scene, rng)
+    boxed = alternatives.box(g, scene, rng)
     low, high = np.quantile(g.means, [0.02, 0.98], axis=0)
     assert boxed.means.shape == g.means.shape and np.all((boxed.means >= low) & (boxed.means <= high))
-    tight = initialisers.box(g, scene._replace(extent=0.4), rng)
+    tight = alternatives.box(g, scene._replace(extent=0.4), rng)
     assert_allclose(np.exp(tight.log_scales), 0.02, rtol=1e-6)  # a twentieth, as 30 points lie wide apart
     assert np.exp(boxed.log_scales).max() > 0.02
-    many = initialisers.box(make_gaussians(rng, 2_000), scene, rng).means
+    many = alternatives.box(make_gaussians(rng, 2_000), scene, rng).means
     wide = np.quantile(make_gaussians(rng, 2_000).means, [0.02, 0.98], axis=0)
     assert_allclose(np.ptp(many, axis=0), wide[1] - wide[0], rtol=0.15)  # of other 2,000: 96 % of the points
     assert not boxed.sh_dc.any() and boxed.sh_rest.shape == g.sh_rest.shape and not np.isin(boxed.means, g.means).any()
     few = type(g)(*(field[:2] for field in g))
-    assert initialisers.planes(few, scene, rng) is None and initialisers.box(few, scene, rng) is None
+    assert alternatives.planes(few, scene, rng) is None and alternatives.box(few, scene, rng) is None
     dense = rng.normal(size=(50, 3)), np.zeros((50, 3), np.uint8)
-    monkeypatch.setattr(initialisers, "densify_points", lambda given: dense)
-    found = initialisers.stereo(g, scene, rng)
+    monkeypatch.setattr(alternatives, "densify_points", lambda given: dense)
+    found = alternatives.stereo(g, scene, rng)
     assert_allclose(found.means, dense[0], rtol=1e-6)
     assert found.sh_rest.shape[1:] == g.sh_rest.shape[1:]
 
 
 def test_a_training_begins_with_what_the_initialiser_gives(scene):
     """After the first iteration there are grey Gaussians without moments, and other parameters are as trained."""
-    recipe = configure(scale_recipe(find_recipe("gaustudio"), 1), initialiser=initialisers.box)
+    recipe = configure(scale_recipe(find_recipe("gaustudio"), 1), initialiser=alternatives.box)
     state = train(scene, recipe, seed=0)
     assert len(state.gaussians.means) == len(scene.points) and not state.gaussians.sh_dc.any()
     assert not any(moment.any() for moment in (*state.adam.first, *state.adam.second))
@@ -349,12 +350,12 @@ def test_a_training_begins_with_what_the_initialiser_gives(scene):
 
 def test_surfels_that_are_flat_already_keep_their_axes(rng):
     flat = make_gaussians(rng, 5)
-    surfels = representations.surfels().extend(flat, rng)
+    surfels = alternatives.surfels().extend(flat, rng)
     assert_array_equal(surfels.quats, flat.quats)
     assert_array_equal(surfels.log_scales[:, :2], flat.log_scales[:, :2])
     round_ones = flat._replace(log_scales=np.full((5, 3), -1.0))
-    assert not np.isin(representations.surfels().extend(round_ones, rng).quats, flat.quats).any()
-    assert representations.gaussians().extend(flat, rng) is flat
+    assert not np.isin(alternatives.surfels().extend(round_ones, rng).quats, flat.quats).any()
+    assert alternatives.gaussians().extend(flat, rng) is flat
 
 
 class State:
@@ -369,13 +370,13 @@ class State:
 
 def test_density_modules(monkeypatch, rng, scene):
     edits = []
-    monkeypatch.setattr(densities, "apply_edit", lambda state, edit: edits.append(edit))
+    monkeypatch.setattr(alternatives, "apply_edit", lambda state, edit: edits.append(edit))
     monkeypatch.setattr("minisplat_ref.methods.gaussian_splatting.apply_edit", lambda state, edit: edits.append(edit))
     context = rendered(photograph(np.zeros((2, 2, 3))), None)
     state = State(rng)
-    assert "fixed" in densities.fixed(state, context) and not edits and "gradient_sum" in state.stats
-    densities.halves(State(rng), context)
-    densities.clones(State(rng), context)
+    assert "fixed" in alternatives.fixed(state, context) and not edits and "gradient_sum" in state.stats
+    alternatives.halves(State(rng), context)
+    alternatives.clones(State(rng), context)
     halved, cloned = edits
     assert halved.parent_ids.tolist() == [0, 1, 2, 0, 1] and len(halved.gaussians.means) == 5
     assert len(cloned.gaussians.means) == 5
@@ -383,7 +384,7 @@ def test_density_modules(monkeypatch, rng, scene):
     for size, n_as_large in ((0.02, 0), (0.005, 2)):  # above a hundredth of the extent, 1, it is split, else cloned
         state = State(rng)
         state.gaussians.log_scales[0] = np.log(size * context.scene.extent)
-        densities.clones(state, context)
+        alternatives.clones(state, context)
         scales = np.exp(edits[-1].gaussians.log_scales[:, 0])
         assert np.count_nonzero(np.isclose(scales, size * context.scene.extent)) == n_as_large, size
 
@@ -425,7 +426,7 @@ def check_background(trained, recipe, scene):
     assert sky.shape == (backgrounds.N_BALL, 5) and np.abs(sky - white_ball(len(sky))).max() > 0.01
     ours = recipe.renderer.render(trained.model, view, Request(BACKGROUND))[0]
     without = recipe.renderer.render(trained.model._replace(shared={}), view, Request())[0]
-    light, _ = BALL.draw(sky, view.camera, Request(BACKGROUND))
+    light, _ = BALL.render(sky, view.camera, Request(BACKGROUND))
     assert_allclose(
         ours.image[..., :3], put_behind(without.image[..., :3], ours.alpha, light), atol=PARITY_FLOAT32_IMAGE
     )

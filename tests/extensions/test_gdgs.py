@@ -9,19 +9,19 @@ from numpy.testing import assert_allclose
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.gdgs import method
-from minisplat_ref.extensions.gdgs.method import control_by_region, crowding, on_planes, surface_attraction
-from minisplat_ref.extensions.gdgs.predictor import predict_centers
-from minisplat_ref.extensions.gdgs.reference import (
+from minisplat_ref.extensions.gdgs import recipe
+from minisplat_ref.extensions.gdgs.model import (
     Regions,
     Weights,
     attract,
     contract,
     densest,
     disperse,
+    predict_centers,
     regions_of,
     unevenness,
 )
+from minisplat_ref.extensions.gdgs.recipe import control_by_region, crowding, on_planes, surface_attraction
 from minisplat_ref.mechanisms.oriented.planes import LocalPlanes
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between, normals_of
 from minisplat_ref.rendering import Request
@@ -89,7 +89,7 @@ def test_pairs_beyond_reach_do_not_count():
 
 def test_of_a_crowd_every_kth_stands_for_the_others(monkeypatch):
     """Ten points on a line, of which at most four are paired: every third, 3 apart, each pushed by its neighbours."""
-    monkeypatch.setattr("minisplat_ref.extensions.gdgs.reference.PAIRED_MAX", 4)
+    monkeypatch.setattr("minisplat_ref.extensions.gdgs.model.PAIRED_MAX", 4)
     means = np.zeros((10, 3))
     means[:, 0] = np.arange(10)
     value, v = disperse(means, [np.arange(10)], 2.0)
@@ -146,7 +146,7 @@ def rendered(points, gaussians, step):
 def test_terms_act_in_one_of_a_hundred_iterations(rng):
     points = rng.normal(size=(30, 3))
     g = gaussians_at(rng.normal(size=(50, 3)))
-    term = {"weights": method.WEIGHTS, "offset": 0.0, "period": 100}
+    term = {"weights": recipe.WEIGHTS, "offset": 0.0, "period": 100}
     values = [surface_attraction(rendered(points, g, step), **term)[0] for step in (5_000, 5_001, 5_002, 5_101)]
     assert values[0] == values[2] == 0 < values[1] == values[3]
     with pytest.raises(InputError, match="scene s has 2 points: train with --set surface_attraction=0"):
@@ -168,7 +168,7 @@ def test_control_clones_where_gradients_are_large_and_density_is_uneven(monkeypa
     means = np.concatenate([np.full((8, 3), 0.4), corners + np.array([2.0, 0, 0])])
     gradients = np.where(np.arange(16) % 8 < 2, 1.0, 0.0)
     state, edits = State(gaussians_at(means), gradients), []
-    monkeypatch.setattr(method, "apply_edit", lambda state, edit: edits.append(edit))
+    monkeypatch.setattr(recipe, "apply_edit", lambda state, edit: edits.append(edit))
     iteration = rendered(np.array([[0.0, 0, 0], [4, 2, 2]]), None, 1)
     how = {"threshold": 0.5, "n_cells": 2, "min_unevenness": 1.0, "jitter": 0.1}
     assert control_by_region(state, iteration, **how) is None
@@ -184,7 +184,7 @@ def test_control_clones_where_gradients_are_large_and_density_is_uneven(monkeypa
 def test_clones_lie_a_tenth_of_a_deviation_away(monkeypatch):
     """Of 400 Gaussians in one octant, deviations of e^-1, e^-1 and e^-3: the mean square of what clones move."""
     state, edits = State(gaussians_at(np.full((400, 3), 0.4)), np.ones(400)), []
-    monkeypatch.setattr(method, "apply_edit", lambda state, edit: edits.append(edit))
+    monkeypatch.setattr(recipe, "apply_edit", lambda state, edit: edits.append(edit))
     iteration = rendered(np.array([[0.0, 0, 0], [2, 2, 2]]), None, 1)
     control_by_region(state, iteration, threshold=0.5, n_cells=1, min_unevenness=1.0, jitter=0.1)
     moved = edits[0].gaussians.means[400:] - 0.4
@@ -192,7 +192,7 @@ def test_clones_lie_a_tenth_of_a_deviation_away(monkeypatch):
 
 
 def test_repulsion_reaches_an_eighth_of_a_region():
-    assert method.spacing_of(Regions(np.zeros(3), 2.0, (1, 1, 1))) == 0.25
+    assert recipe.spacing_of(Regions(np.zeros(3), 2.0, (1, 1, 1))) == 0.25
 
 
 def test_the_recipe_trains_through_the_command_line(tmp_path):

@@ -7,8 +7,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref.extensions.geometry import EXTENSION, kernels, reference
-from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
-from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smoothness, normal_smoothness_vjp
+from minisplat_ref.extensions.geometry.reference import (
+    depth_normals,
+    depth_normals_vjp,
+    edge_weights,
+    normal_smoothness,
+    normal_smoothness_vjp,
+)
 from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting

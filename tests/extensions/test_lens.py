@@ -11,8 +11,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.lens.gradient_checks import OPTICS, stages
-from minisplat_ref.extensions.lens.method import THROUGH_LENS
+from minisplat_ref.extensions.lens.model import OPTICS, THROUGH_LENS, stages
 from minisplat_ref.io import load_scene, viewpoints
 from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.models import model_of

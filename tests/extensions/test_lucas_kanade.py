@@ -14,22 +14,34 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.lucas_kanade import losses, pyramid
-from minisplat_ref.extensions.lucas_kanade.gradient_checks import stages
-from minisplat_ref.extensions.lucas_kanade.losses import depth_order, flow, next_view, ordered_pairs, rendered_flow
-from minisplat_ref.extensions.lucas_kanade.method import WARPED, first_warp
-from minisplat_ref.extensions.lucas_kanade.moving import CENTERS, GROWTHS, LOG_WIDTH, SHIFTS, TURNS, moved
+from minisplat_ref.extensions.lucas_kanade import pyramid, recipe
+from minisplat_ref.extensions.lucas_kanade.model import (
+    CENTERS,
+    GROWTHS,
+    LOG_WIDTH,
+    SHIFTS,
+    TURNS,
+    WARPED,
+    first_warp,
+    moved,
+    turned,
+    turned_vjp,
+)
 from minisplat_ref.extensions.lucas_kanade.pyramid import optical_flow
-from minisplat_ref.extensions.lucas_kanade.reference import (
+from minisplat_ref.extensions.lucas_kanade.recipe import (
     Pairs,
+    depth_order,
+    flow,
     flow_error,
     flow_error_vjp,
     image_steps,
     image_steps_vjp,
+    next_view,
     order_error,
     order_error_vjp,
-    turned,
-    turned_vjp,
+    ordered_pairs,
+    rendered_flow,
+    stages,
 )
 from minisplat_ref.extensions.velocity.model import MOVING, MovingGaussians
 from minisplat_ref.io.images import read_image, write_image
@@ -130,7 +142,7 @@ def test_what_the_next_camera_does_not_see_in_front_of_it_counts_as_still():
     g = balls([[0, 0, 2], [0.3, 0, 2], [-0.3, 0, 2]], [0.1] * 3, [0.5] * 3)
     after = np.array([[0.0, 0, -1], [0.3, 0, 0.005], [-0.3, 0, 0.5]])
     camera = make_camera(24, 18)
-    _, _, rows = losses.blended_steps(g, after, (camera, camera), Request(backend=REFERENCE))
+    _, _, rows = recipe.blended_steps(g, after, (camera, camera), Request(backend=REFERENCE))
     assert rows.tolist() == [2]
 
 
@@ -434,7 +446,7 @@ def test_a_motion_along_one_axis_alone_is_unknown(rng, tmp_path):
     given = np.zeros((18, 24, 2))
     given[4, 5, 0] = given[6, 7, 1] = np.nan
     np.save(tmp_path / "view0.npy", given)
-    known = losses._given_flow(tmp_path, view)
+    known = recipe._given_flow(tmp_path, view)
     assert np.argwhere(~known.is_known).tolist() == [[4, 5], [6, 7]] and np.isfinite(known.motion).all()
 
 
@@ -445,7 +457,7 @@ def test_a_lone_photograph_is_taken_to_look_the_same_a_unit_of_time_later(rng, m
         asked.append((view.time, other.time))
         return rendered_flow(model, view, other, request)
 
-    monkeypatch.setattr(losses, "rendered_flow", remembered)
+    monkeypatch.setattr(recipe, "rendered_flow", remembered)
     flow(rendered_view(scene, warped(make_gaussians(rng, 30), rng)), flows="")
     assert asked == [(0.25, 1.25)]
 
@@ -456,7 +468,7 @@ def test_depths_are_compared_where_the_image_is_opaque_and_not_masked(rng, tmp_p
     rendered, compared = rendered_view(scene, model), []
     alpha = np.where(np.arange(24) < 12, 0.6, 0.4) * np.ones((18, 1))
     mask = np.arange(18)[:, None] * np.ones((1, 24)) < 9
-    monkeypatch.setattr(losses, "ordered_pairs", lambda *given: compared.append(given[0]) or ordered_pairs(*given))
+    monkeypatch.setattr(recipe, "ordered_pairs", lambda *given: compared.append(given[0]) or ordered_pairs(*given))
     np.save(tmp_path / "view0.npy", rng.uniform(size=(18, 24)))
     seen = rendered._replace(output=rendered.output._replace(alpha=alpha), view=rendered.view._replace(mask=mask))
     depth_order(seen, depths=str(tmp_path), margin=0.0)
@@ -464,7 +476,7 @@ def test_depths_are_compared_where_the_image_is_opaque_and_not_masked(rng, tmp_p
     assert len(rows) == 9 * 12 and rows.max() == 8 and columns.max() == 11
     large = scene.train_views[0]._replace(name="large", camera=make_camera(40, 30))
     np.save(tmp_path / "large.npy", rng.uniform(size=(30, 40)))
-    pixels, depths = losses._map_samples(tmp_path, large, rng)
+    pixels, depths = recipe._map_samples(tmp_path, large, rng)
     assert len(pixels) == len(depths) == len(np.unique(pixels, axis=0)) == 1_024
 
 
@@ -475,7 +487,7 @@ def test_sparse_points_are_at_rows_and_columns(rng):
     view = scene.train_views[0]._replace(camera=camera, point_ids=np.array([0]))
     placed = scene._replace(points=np.array([[0.5, 0.2, 2.0]]))
     rendered = rendered_view(scene, warped(make_gaussians(rng, 30), rng))._replace(scene=placed, view=view)
-    pixels, depths = losses._point_samples(rendered)
+    pixels, depths = recipe._point_samples(rendered)
     assert pixels.tolist() == [[11, 17]] and depths.tolist() == [2.0]
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.geometry.gradient_checks import PIECES as GEOMETRY_PIECES
+from minisplat_ref.extensions.geometry.losses import PIECES as GEOMETRY_PIECES
 from minisplat_ref.mechanisms import orders
 from minisplat_ref.oracle.differences import careful_derivative
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_tools.claims.kit import psnr_of
-from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS, CutGaussians, set_width, with_cuts
+from minisplat_ref.extensions.cuts.model import CUT_GAUSSIANS, CUTS, CutGaussians, set_width, with_cuts
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train

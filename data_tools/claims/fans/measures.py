@@ -8,10 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_tools.claims import kit
+from data_tools.claims.fans.shape_search import best_shape, render_clipped
+from minisplat_ref.extensions.fans.commands import fine_tune, measure
 from minisplat_ref.extensions.fans.mesh_files import write_mesh
-from minisplat_ref.extensions.fans.method import render
-from minisplat_ref.extensions.fans.shapes import FRONT_REACH, Fans, FanShape, convert_gaussians, mesh_of, visible_mesh
-from minisplat_ref.extensions.fans.tuning import best_shape, fine_tune, measure, render_clipped
+from minisplat_ref.extensions.fans.model import (
+    FRONT_REACH,
+    Fans,
+    FanShape,
+    convert_gaussians,
+    mesh_of,
+    render_fans,
+    visible_mesh,
+)
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.schedule import scale_recipe
@@ -103,11 +111,11 @@ def refit_rows(
 def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
     """Return the error of images of a few layers against that of all, and the number of layers of a pixel."""
     request = Request(judge.scene.background.astype(np.float32))
-    whole = [render(Model(fans), view, request) for view in judge.views]
+    whole = [render_fans(Model(fans), view, request) for view in judge.views]
     layers = np.concatenate([tape.peeled.n_layers.ravel() for _, tape in whole])
     rows: list[dict[str, Any]] = [{"layers": "all", "mean": float(layers.mean()), "most": int(layers.max())}]
     for n in LAYERS:
-        images = [render(Model(fans), view, request, max_layers=n)[0].image for view in judge.views]
+        images = [render_fans(Model(fans), view, request, max_layers=n)[0].image for view in judge.views]
         squares = [np.mean((image - output.image) ** 2) for image, (output, _) in zip(images, whole, strict=True)]
         rows.append({"layers": n, "rms_levels": 255 * float(np.sqrt(np.mean(squares)))})
     return rows

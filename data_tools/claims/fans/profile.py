@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
+from data_tools.claims.fans.shape_search import alpha_of
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.fans.shapes import FRONT_REACH, FanShape, convert_gaussians
-from minisplat_ref.extensions.fans.tuning import alpha_of
+from minisplat_ref.extensions.fans.model import FRONT_REACH, FanShape, convert_gaussians
 from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Camera, Floats, Gaussians, view_from
 

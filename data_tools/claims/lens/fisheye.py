@@ -29,7 +29,7 @@ from minisplat_ref.datasets.synthetic.geometry import first_hits
 from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.tracer import World, points_along, radiance
-from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
+from minisplat_ref.extensions.lens.model import LENS, THROUGH_LENS
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io.lens import Lens, undistort

@@ -24,10 +24,9 @@ from data_tools.claims.kit.figures import group, subplots
 from data_tools.claims.kit.tables import spread, table
 from data_tools.claims.lucas_kanade.body import ARC, RADIUS, Body, camera_at, film, make_body
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.lucas_kanade.losses import blended_steps, next_view, rendered_flow
-from minisplat_ref.extensions.lucas_kanade.moving import moved
+from minisplat_ref.extensions.lucas_kanade.model import moved
 from minisplat_ref.extensions.lucas_kanade.pyramid import optical_flow
-from minisplat_ref.extensions.lucas_kanade.reference import image_steps
+from minisplat_ref.extensions.lucas_kanade.recipe import blended_steps, image_steps, next_view, rendered_flow
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.motion.field import basis, choose_centers, powers
 from minisplat_ref.mechanisms.motion.velocity import Warp, canonical_velocity, integrate, invert, velocity_of_backward

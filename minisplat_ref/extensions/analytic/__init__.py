@@ -2,7 +2,7 @@
 
 This follows Analytic-Splatting, Liang et al. 2024, arXiv 2403.11056. A pixel collects light from a square. 3DGS takes
 the value of the footprint at its centre, which misses anything thinner than a pixel; hence its low-pass. Here alpha is
-the integral over the square, in closed form, without a low-pass (:mod:`minisplat_ref.extensions.analytic.reference`):
+the integral over the square, in closed form, without a low-pass (:mod:`minisplat_ref.extensions.analytic.response`):
 
     alpha = o 2 pi l_1 l_2 prod_k [F((u_k + 1/2) / l_k) - F((u_k - 1/2) / l_k)]
 
@@ -23,8 +23,7 @@ thresholds for the longest and thinnest footprints are replaced by bounds of the
     minisplat-ref oracle gradients --extension analytic
 """
 
-from minisplat_ref.extensions.analytic.gradient_checks import stages
-from minisplat_ref.extensions.analytic.method import ANALYTIC, INTEGRATED
+from minisplat_ref.extensions.analytic.model import ANALYTIC, INTEGRATED, stages
 from minisplat_ref.extensions.extension import Extension
 
 EXTENSION = Extension("analytic", recipes=(ANALYTIC,), representation=INTEGRATED, stages=stages)

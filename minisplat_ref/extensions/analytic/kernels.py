@@ -10,7 +10,7 @@ import numpy as np
 
 from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.extensions.analytic.reference import CUBIC, LINEAR, Axes, axes_of, axes_of_vjp
+from minisplat_ref.extensions.analytic.response import CUBIC, LINEAR, Axes, axes_of, axes_of_vjp
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO

@@ -4,7 +4,7 @@ This is Mip-Splatting, Yu et al. 2023, arXiv 2311.16493. 3DGS adds 0.3 px^2 to e
 it is. At the size of training that is harmless, since training compensates for it; seen from farther away everything
 swells and brightens, and from nearer it thins out, down to needles. Two filters replace this dilation:
 
-- one in space (:mod:`minisplat_ref.extensions.antialiasing.reference`), once for all views:
+- one in space (:mod:`minisplat_ref.extensions.antialiasing.model`), once for all views:
   ``s'^2 = s^2 + 0.2 nu^2`` and ``o' = o prod_j s_j / s'_j``, where nu is the minimum distance ``z / f`` between two
   pixels' rays over the training views that see the Gaussian. So nothing is thinner than the cameras could resolve;
 - one in the image, ``C' = C + 0.1 I`` and ``o'' = o' sqrt(det C / det C')``. This is the core's own compensation with
@@ -30,7 +30,7 @@ instead of s and o, a PLY of six fields.
 """
 
 from minisplat_ref.extensions.antialiasing import fuse
-from minisplat_ref.extensions.antialiasing.method import ANTIALIASING, FILTERED
+from minisplat_ref.extensions.antialiasing.model import ANTIALIASING, FILTERED
 from minisplat_ref.extensions.extension import Extension
 
 EXTENSION = Extension("antialiasing", recipes=(ANTIALIASING,), representation=FILTERED, commands=(fuse,))

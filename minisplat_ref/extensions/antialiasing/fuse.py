@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.antialiasing.method import EPS2D, FilteredGaussians, apply_filters
+from minisplat_ref.extensions.antialiasing.model import EPS2D, FilteredGaussians, apply_filters
 from minisplat_ref.io.ply import further_properties, load_ply, read_label, save_ply
 from minisplat_ref.io.run_files import model_file
 

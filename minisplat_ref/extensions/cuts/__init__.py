@@ -1,9 +1,8 @@
 """Cuts: a Bezier curve in each Gaussian's plane cuts a part of it away, so edges are sharp.
 
 This follows DisC-GS, Qu et al. 2024, arXiv 2405.15196. A Gaussian is smooth, and spills over the edges of objects. Here
-each has cubic curves in the plane of its first two axes (:mod:`minisplat_ref.extensions.cuts.response`), as many as
-``n_curves``, by default one, and the part behind a curve, seen from the centre, is cut away
-(:mod:`minisplat_ref.extensions.cuts.curve`):
+each has cubic curves in the plane of its first two axes, as many as ``n_curves``, by default one, and the part behind a
+curve, seen from the centre, is cut away (:mod:`minisplat_ref.extensions.cuts.response`):
 
     alpha = o exp(-d^T Q d / 2) mask(d),   mask = 1 where the segment from the centre to d crosses the curves an
                                                   even number of times, else 0
@@ -28,8 +27,7 @@ gradient shows. Training does not change which axes are the first two; if a Gaus
 curves are seen edge on.
 """
 
-from minisplat_ref.extensions.cuts.gradient_checks import stages
-from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS
+from minisplat_ref.extensions.cuts.model import CUT_GAUSSIANS, CUTS, stages
 from minisplat_ref.extensions.extension import Extension
 
 EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages)

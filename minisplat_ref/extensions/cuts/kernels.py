@@ -12,8 +12,7 @@ import numpy as np
 
 from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import CONIC_GRADIENTS, MEAN_X, OPACITY, KernelResponse, conic_response
-from minisplat_ref.extensions.cuts.curve import LENGTH_MIN, N_EDGES, N_POINTS, VERTICES
-from minisplat_ref.extensions.cuts.response import CutFootprints
+from minisplat_ref.extensions.cuts.response import LENGTH_MIN, N_EDGES, N_POINTS, VERTICES, CutFootprints
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, ZERO

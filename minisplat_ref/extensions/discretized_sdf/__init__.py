@@ -34,8 +34,8 @@ it hides something else, train with ``--set silhouette=0``. With another recipe,
 opacities.
 """
 
-from minisplat_ref.extensions.discretized_sdf.gradient_checks import stages
-from minisplat_ref.extensions.discretized_sdf.method import DISTANCED, RECIPE
+from minisplat_ref.extensions.discretized_sdf.model import DISTANCED, stages
+from minisplat_ref.extensions.discretized_sdf.recipe import RECIPE
 from minisplat_ref.extensions.extension import Extension
 
 EXTENSION = Extension("discretized-sdf", recipes=(RECIPE,), representation=DISTANCED, stages=stages)

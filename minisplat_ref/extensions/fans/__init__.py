@@ -2,7 +2,7 @@
 
 This follows MeshSplats, Tobiasz et al. 2025, arXiv 2502.07754. A trained Gaussian becomes a fan of n triangles about
 its centre, or three fans in the planes of its axes, with a colour and an opacity at each vertex
-(:mod:`minisplat_ref.extensions.fans.shapes`):
+(:mod:`minisplat_ref.extensions.fans.model`):
 
     rim vertex j:  mu + k (s_a cos(2 pi j / n) e_a + s_b sin(2 pi j / n) e_b)
     opacity:       o at the centre, rim o on the rim, linear in between;  colour: that of degree 0
@@ -30,10 +30,9 @@ Left out are textures, view-dependent colour, growing new fans, and pruning by g
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.fans import export, fine_tune
-from minisplat_ref.extensions.fans.gradient_checks import stages
+from minisplat_ref.extensions.fans import commands
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans
-from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
+from minisplat_ref.extensions.fans.model import FANS, FANS_OF_GAUSSIANS, stages
 
 EXTENSION = Extension(
     "fans",
@@ -41,6 +40,6 @@ EXTENSION = Extension(
     representation=FANS_OF_GAUSSIANS,
     save=save_fans,
     load=load_fans,
-    commands=(export, fine_tune),
+    commands=(commands,),
     stages=stages,
 )

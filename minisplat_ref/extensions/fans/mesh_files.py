@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.fans.shapes import SOLID_PLANES, Fans, FanShape, mesh_of
+from minisplat_ref.extensions.fans.model import SOLID_PLANES, Fans, FanShape, mesh_of
 from minisplat_ref.io.label import Label, to_comments
 from minisplat_ref.io.ply import COLORS, MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces

@@ -3,7 +3,7 @@
 This follows GaMeS: Mesh-Based Adapting and Modification of Gaussian Splatting (2024), arXiv 2402.01459, for a scene
 whose mesh is given. Each face carries a fixed number of Gaussians. A Gaussian stores its weights of the three corners
 and its size relative to the face, so its mean lies on the face, its normal is that of the face, and its other two axes
-are those of the face (:mod:`.faces` has the equations). Whatever moves the corners moves the Gaussians.
+are those of the face (:mod:`.model` has the equations). Whatever moves the corners moves the Gaussians.
 
     minisplat-ref mesh runs/fox --out fox.ply
     minisplat-ref train data/fox --recipe games --init fox.ply --set per_face=5 --out runs/on_mesh
@@ -25,7 +25,7 @@ Left out are corners that are trained, the soup of triangles for scenes without 
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.games.method import GAMES, ON_FACES
+from minisplat_ref.extensions.games.model import GAMES, ON_FACES
 
 EXTENSION = Extension("games", recipes=(GAMES,), representation=ON_FACES)
 """Gaussians on faces, the recipe that trains them."""

@@ -1,8 +1,8 @@
 """GauStudio: stages that are exchanged by name, and a background for what is far away.
 
 This follows GauStudio, Ye et al. 2024, arXiv 2403.19632, and its code: a training is a chain of modules, each of which
-has alternatives. A module here is a function, a stage a setting of the recipe that names one of the functions in its
-file, and ``--set`` exchanges it; :mod:`minisplat_ref.extensions.gaustudio.modules` lists them as data.
+has alternatives. A module here is a function, a stage a setting of the recipe that names one, and ``--set`` exchanges
+it for another with the same parameters (:mod:`.alternatives` and :mod:`.backgrounds`; :mod:`.commands` lists them).
 
 Gaussians cannot be infinitely far away, so a training hangs the sky in front of the cameras. The background takes its
 place: a ball of K = 10,000 Gaussians on a Fibonacci lattice, white at first, or a map of directions, or harmonics.
@@ -33,14 +33,13 @@ initialisers and depths that need a network, and the balls of several radii.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.gaustudio import masks, modules
-from minisplat_ref.extensions.gaustudio.gradient_checks import stages
-from minisplat_ref.extensions.gaustudio.method import RECIPE, STUDIO
+from minisplat_ref.extensions.gaustudio import commands
+from minisplat_ref.extensions.gaustudio.model import RECIPE, STUDIO, stages
 
 EXTENSION = Extension(
     "gaustudio",
     recipes=(RECIPE,),
     representation=STUDIO,
-    commands=(modules, masks),
+    commands=(commands,),
     stages=stages,
 )

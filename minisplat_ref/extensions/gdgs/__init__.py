@@ -3,7 +3,7 @@
 This follows GDGS, 2025, arXiv 2507.00363. A network that maps noisy points of the scene to the points themselves gives
 the first centres, and principal axes of the nearest neighbours give each Gaussian its plane. In one of a hundred
 iterations from 5,000 on each Gaussian is pulled to the plane (m, N) of its nearest point, and its shortest axis U along
-the normal (:mod:`minisplat_ref.extensions.gdgs.reference`):
+the normal (:mod:`minisplat_ref.extensions.gdgs.model`):
 
     L = l_d mean(((mu - m) . N - d)^2) + l_a mean(1 - |U . N|) + l_s mean(|mu - m|^2)
 
@@ -28,6 +28,6 @@ factor.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.gdgs.method import GDGS, SURFACED
+from minisplat_ref.extensions.gdgs.recipe import GDGS, SURFACED
 
 EXTENSION = Extension("gdgs", recipes=(GDGS,), representation=SURFACED)

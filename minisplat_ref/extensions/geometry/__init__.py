@@ -20,7 +20,6 @@ All are functions of the expected depth ``sum w z / alpha``, so their gradient g
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.geometry.gradient_checks import stages
-from minisplat_ref.extensions.geometry.losses import LOSSES
+from minisplat_ref.extensions.geometry.losses import LOSSES, stages
 
 EXTENSION = Extension("geometry", losses=LOSSES, stages=stages)

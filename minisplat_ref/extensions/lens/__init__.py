@@ -28,7 +28,6 @@ pixel may be missed by all rays.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.lens.gradient_checks import stages
-from minisplat_ref.extensions.lens.method import LENS, THROUGH_LENS
+from minisplat_ref.extensions.lens.model import LENS, THROUGH_LENS, stages
 
 EXTENSION = Extension("lens", recipes=(LENS,), representation=THROUGH_LENS, stages=stages)

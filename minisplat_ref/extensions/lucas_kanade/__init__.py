@@ -33,7 +33,7 @@ motion, and the rotation of spherical harmonics with their Gaussian.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.lucas_kanade.gradient_checks import stages
-from minisplat_ref.extensions.lucas_kanade.method import LUCAS_KANADE, WARPED
+from minisplat_ref.extensions.lucas_kanade.model import WARPED
+from minisplat_ref.extensions.lucas_kanade.recipe import LUCAS_KANADE, stages
 
 EXTENSION = Extension("lucas-kanade", recipes=(LUCAS_KANADE,), representation=WARPED, stages=stages)

@@ -280,7 +280,7 @@ def test_a_choice_by_hand(tmp_path, recwarn):
 
 def test_an_unlabelled_file_of_further_fields_says_what_is_left_out(run_of, tmp_path):
     """As earlier versions wrote it; with the extension once given, a copy is labelled."""
-    from minisplat_ref.extensions.antialiasing.method import FilteredGaussians
+    from minisplat_ref.extensions.antialiasing.model import FilteredGaussians
 
     ours = run_of("antialiasing") / "point_cloud.ply"
     old = tmp_path / "old.ply"
@@ -313,7 +313,7 @@ def test_an_extension_whose_save_knows_no_label(tmp_path, monkeypatch):
 
 def test_fuse(run_of, tmp_path, capfd):
     """Six fields for any viewer, with s' = sqrt(s^2 + f^2) and o' = o prod s / s' worked out here."""
-    from minisplat_ref.extensions.antialiasing.method import FilteredGaussians
+    from minisplat_ref.extensions.antialiasing.model import FilteredGaussians
 
     run, out = run_of("antialiasing"), tmp_path / "fused.ply"
     assert main(["antialiasing", "fuse", str(run), str(out)]) == 0

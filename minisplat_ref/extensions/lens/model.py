@@ -1,4 +1,4 @@
-"""The renderer of Gaussians along the true rays of a lens, and its gradient."""
+"""The renderer of Gaussians along the true rays of a lens, its gradient, the checks of both, and the recipe."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,6 +9,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.cameras.kernels import response_for
+from minisplat_ref.mechanisms.cameras.models import are_inside
 from minisplat_ref.mechanisms.cameras.ray_footprints import (
     RESPONSE,
     FootprintGradient,
@@ -17,20 +18,25 @@ from minisplat_ref.mechanisms.cameras.ray_footprints import (
     project,
     project_vjp,
 )
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.oracle.models import Drawn, hit_sides, model_stage
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
-from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, parameters_vjp
-from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.rendering.splatting import append_depths
-from minisplat_ref.types import (
-    Camera,
-    Floats,
-    Ints,
-    Model,
-    Primitives,
-    RenderOutput,
-    TileBins,
-    View,
+from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.rendering import (
+    SPLATTING,
+    Renderer,
+    RenderGradient,
+    Request,
+    activate,
+    choose_degree,
+    parameters_vjp,
 )
+from minisplat_ref.rendering.backends import REFERENCE, Backend
+from minisplat_ref.rendering.splatting import append_depths
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.types import Camera, Floats, Ints, Model, Optics, Primitives, RenderOutput, TileBins, View
 
 WANTS = frozenset({"depth", "stats", "median_depth", "dominant_depth"})
 
@@ -49,13 +55,13 @@ class Prepared(NamedTuple):
     conventions: Conventions
     backend: Backend
 
-    def listed(self) -> TileBins:
+    def list_tiles(self) -> TileBins:
         """Return the tiles' lists, nearest means first."""
         return list_tiles(self.footprints, self.camera, self.backend, self.conventions)
 
 
-class Tape(NamedTuple):
-    """The values that :func:`render` keeps for :func:`render_vjp`."""
+class _Tape(NamedTuple):
+    """The values that :func:`render_through_lens` keeps for :func:`render_through_lens_vjp`."""
 
     prepared: Prepared
     bins: TileBins
@@ -87,7 +93,7 @@ def prepare(model: Model, camera: Camera, request: Request) -> Prepared:
     )
 
 
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Tape]:
+def render_through_lens(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
     """Render a view as its camera's lens shows it; return the image and a tape.
 
     Raises
@@ -100,7 +106,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Ta
         names = ", ".join(sorted(request.wants - WANTS))
         raise InputError(f"lens does not give {names}: use a recipe that does not ask for it, such as 3dgs-accel")
     p = prepare(model, view.camera, request)
-    bins = p.listed()
+    bins = p.list_tiles()
     blend = (
         partial(kernel_hits.composite_hits, response_for(p.channels.dtype))
         if p.backend.is_compiled
@@ -120,12 +126,15 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Ta
         assert output.stats is not None
         extras["dominant_depth"] = np.append(p.footprints.depths, 0)[output.stats.dominant_ids].astype(p.channels.dtype)
     visible_ids = np.flatnonzero(p.footprints.radii[:, 0] > 0)
-    tape = Tape(p, bins, output)
+    tape = _Tape(p, bins, output)
     return output._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids), extras=extras), tape
 
 
-def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`; means and pose have two terms, of the rays and of the viewing direction."""
+def render_through_lens_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render_through_lens`.
+
+    Means and pose have two terms, of the rays and of the viewing direction.
+    """
     p, bins, output = tape
     g, footprints = p.gaussians, p.footprints
     v_output = v_image, np.zeros_like(output.alpha) if v_alpha is None else v_alpha
@@ -149,3 +158,39 @@ def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> Re
         cam_from_world_t=v_primitives.cam_from_world_t + v_sh.cam_from_world_t,
         means2d=v_means2d,
     )
+
+
+THROUGH_LENS = Representation(
+    "gaussians along the rays of a lens",
+    renderer=Renderer("lens", render_through_lens, render_through_lens_vjp, SPLATTING.channels),
+    takes_optics=True,
+    is_inside=are_inside,
+)
+
+OPTICS = (
+    None,
+    Optics("brown", (-0.2, 0.05, 0.01, 0.02, 0.01, 0.0, 0.01, -0.02)),
+    Optics("fisheye", (0.05, -0.02, 0.01, 0.0)),
+)
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the renderer with each lens; points record which hits are listed, blended and clamped."""
+    return tuple(_stage(backend, setting, optics, rng) for optics in OPTICS)
+
+
+def _stage(backend: Backend, setting: Setting, optics: Optics | None, rng: np.random.Generator) -> Stage:
+    camera = setting.camera._replace(optics=optics)
+    bent = setting._replace(camera=camera)
+    name = THROUGH_LENS.name if optics is None else f"{THROUGH_LENS.name}, {optics.model}"
+
+    def sides(drawn: Drawn) -> list[np.ndarray]:
+        prepared = prepare(drawn.model, drawn.view.camera, drawn.request._replace(backend=REFERENCE))
+        bins = prepared.list_tiles()
+        return [bins.gaussian_ids, *hit_sides(tile_hits(prepared.footprints, bins, setting.conventions, RESPONSE))]
+
+    return model_stage(backend, bent, THROUGH_LENS._replace(name=name), rng, sides_of=sides)
+
+
+LENS = GS_ACCEL._replace(name="lens")
+"""The recipe ``lens``: 3DGS on photographs as they were taken."""

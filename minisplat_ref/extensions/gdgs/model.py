@@ -1,17 +1,39 @@
-"""The formulas of GDGS: attraction to planes along their normals, and contraction or dispersion within a region."""
+"""The predictor of initial centres, attraction to planes along their normals, and contraction or dispersion of regions.
+
+The predictor is a network that maps noisy points to the points themselves. It is trained on the points of the scene
+alone, which makes it in effect a denoising autoencoder: its output is smoother than its input, because a small network
+cannot follow every point.
+"""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from minisplat_ref.mechanisms.networks.mlp import forward, make_network, train_step, zero_moments
 from minisplat_ref.mechanisms.oriented.planes import LocalPlanes
 from minisplat_ref.mechanisms.oriented.thin_axis import normals_of, normals_of_vjp
 from minisplat_ref.types import Floats, Ints
 
+HIDDEN = (64, 64)  # of the predictor, as are the next two lines
+STEPS, BATCH, RATE = 600, 1024, 3e-3
+NOISE = 0.01  # of the inputs, in units of the points' deviation
 SIDE_MIN = 1e-30  # world units: of a region, where all points lie in one place
 REACH = 3.0  # h: pairs further apart repel each other by less than a ninetieth
 PAIRED_MAX = 2048  # primitives of a region whose pairs are computed: at most 2 million pairs, some 200 MB
+
+
+def predict_centers(points: Floats, rng: np.random.Generator) -> Floats:
+    """Train the predictor on points [P, 3], and return its centres for them."""
+    middle, spread = points.mean(axis=0), float(points.std()) or 1.0
+    x = (points - middle) / spread
+    network = make_network((3, *HIDDEN, 3), rng)
+    moments = zero_moments(network)
+    for step in range(1, STEPS + 1):
+        rows = rng.integers(0, len(x), min(BATCH, len(x)))
+        noisy = x[rows] + NOISE * rng.normal(size=(len(rows), 3))
+        train_step(network, noisy, x[rows], RATE * (1 - (step - 1) / STEPS), moments, step)
+    return middle + spread * forward(network, x)[0]
 
 
 class Weights(NamedTuple):

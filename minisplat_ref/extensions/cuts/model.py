@@ -1,4 +1,4 @@
-"""The population of Gaussians with cuts, its renderer, and the recipe that trains it."""
+"""The population of Gaussians with cuts, its renderer, its gradient check, and the recipe that trains it."""
 
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -6,12 +6,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.cuts.curve import N_POINTS
 from minisplat_ref.extensions.cuts.kernels import response_for
-from minisplat_ref.extensions.cuts.response import RESPONSE, CutFootprints, image_points, image_points_vjp
+from minisplat_ref.extensions.cuts.response import (
+    N_EDGES,
+    N_PIECES,
+    N_POINTS,
+    RESPONSE,
+    TOPS,
+    CutFootprints,
+    image_points,
+    image_points_vjp,
+)
+from minisplat_ref.mechanisms.payload.gradient_checks import renderer_stage
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.reference.hits import TileHits
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import At
@@ -94,7 +107,7 @@ def _renderer_of(n_curves: int) -> Renderer:
     return payload_renderer("cuts", payload)
 
 
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+def render_cuts(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
     """Render a view with as many curves as the Gaussians have; see :mod:`minisplat_ref.mechanisms.payload.renderer`.
 
     Raises
@@ -111,19 +124,41 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
     return _renderer_of(n_curves).render(model, view, request)
 
 
+CUT_GAUSSIANS = Representation(
+    "Gaussians with cuts",
+    population=CutGaussians,
+    extend=partial(with_cuts, n_curves=1),
+    renderer=Renderer("cuts", render_cuts, _renderer_of(1).render_vjp, SPLATTING.channels),
+    rates=Rates({"curves": 1e-2, "widths": 0.0}, frozenset()),
+)
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the renderer of two curves as a stage; the reference finds the hits that count, and the nearest pieces."""
+    return (renderer_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
+
+
+def _near(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
+    """Return Gaussians whose curves pass through their bright parts; otherwise little would depend on them."""
+    population = with_cuts(gaussians, rng, n_curves=2)
+    return population._replace(curves=0.4 * population.curves)
+
+
+def _sides(tile: TileHits, colors: Floats) -> tuple[np.ndarray, ...]:
+    """Return which hits count, which are clamped, and the nearest vertex or, numbered after the vertices, piece."""
+    is_hit, found = tile.alphas > 0, tile.hit.place.cut
+    edges, (curves, pieces) = np.arange(N_EDGES), np.divmod(found.pieces, N_PIECES)
+    first, last = np.array([*edges, 0, N_EDGES]), np.array([*edges + 1, 0, N_EDGES])  # vertices of each piece
+    nearest = np.where(found.fractions > 0, N_EDGES + 1 + pieces, first[pieces])
+    nearest = np.where(found.fractions < TOPS[pieces], nearest, last[pieces])
+    return is_hit, tile.is_clamped, np.where(is_hit, nearest, -1), np.where(is_hit, curves, -1)
+
+
 def set_width(state: TrainState, iteration: Iteration, *, width: float) -> None:
     """Set the width of all masks to ``width`` pixels; 0 makes hard edges."""
     gaussians: Any = state.gaussians
     state.gaussians = gaussians._replace(widths=np.full_like(gaussians.widths, width))
 
-
-CUT_GAUSSIANS = Representation(
-    "Gaussians with cuts",
-    population=CutGaussians,
-    extend=partial(with_cuts, n_curves=1),
-    renderer=Renderer("cuts", render, _renderer_of(1).render_vjp, SPLATTING.channels),
-    rates=Rates({"curves": 1e-2, "widths": 0.0}, frozenset()),
-)
 
 CUTS = GS_ACCEL._replace(
     name="cuts",

@@ -1,34 +1,20 @@
-"""Refitting: the two numbers of all fans at once, or every vertex by itself."""
+"""The search for the reach and the rim of all fans at once, and images of fans or of Gaussians."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
-from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, FINE_TUNING
-from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians
-from minisplat_ref.metrics import Evaluation, evaluate
-from minisplat_ref.rendering import RenderSettings, Request
-from minisplat_ref.training.fine_tuning import fine_tune as train_further
-from minisplat_ref.training.representation import GAUSSIANS
-from minisplat_ref.training.schedule import scale_recipe
-from minisplat_ref.training.state import StepReport
-from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
+from minisplat_ref.extensions.fans.commands import find_representation
+from minisplat_ref.extensions.fans.model import FanShape, convert_gaussians
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Floats, Gaussians, Model, View
 
 REACHES = 1.0, 4.0  # between which k is sought
 FIRST_REACHES, FIRST_RIMS = (1.5, 2.0, 2.5, 3.0, 3.5), (0.0, 0.2)  # the best of which a search begins with
 EVALUATIONS = 60  # at most, of one search
-
-
-def fine_tune(
-    fans: Fans, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
-) -> Fans:
-    """Return fans after some iterations of ``FINE_TUNING`` of their vertices; the given ones are not changed."""
-    recipe = scale_recipe(FINE_TUNING, iterations)._replace(representation=FANS_OF_GAUSSIANS)
-    result: Fans = train_further(fans, scene, recipe, seed, on_step)
-    return result
 
 
 def best_shape(
@@ -66,26 +52,15 @@ def best_shape(
     return clipped(minimize(cost, first, method="Nelder-Mead", options=options).x)
 
 
-def representation_of(population: Any) -> Any:
-    """Return the renderer of a population of fans, or of Gaussians."""
-    return FANS_OF_GAUSSIANS if isinstance(population, Fans) else GAUSSIANS
-
-
 def render_clipped(population: Any, view: View, **request: Any) -> Floats:
     """Return the image [H, W, 3] of fans or Gaussians, clipped to [0, 1]; ``request`` as for :class:`Request`."""
-    image = representation_of(population).renderer.render(Model(population), view, Request(**request))[0].image
+    image = find_representation(population).renderer.render(Model(population), view, Request(**request))[0].image
     clipped: Floats = np.clip(image, 0, 1)
     return clipped
 
 
 def alpha_of(population: Any, view: View, **request: Any) -> Floats:
     """Return the accumulated opacity [H, W] of fans or Gaussians."""
-    output, _ = representation_of(population).renderer.render(Model(population), view, Request(**request))
+    output, _ = find_representation(population).renderer.render(Model(population), view, Request(**request))
     alpha: Floats = output.alpha
     return alpha
-
-
-def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
-    """Compare images of fans or Gaussians with photographs."""
-    renderer = representation_of(population).renderer
-    return evaluate(Model(population), views, RenderSettings(scene.background, renderer=renderer))

@@ -1,4 +1,4 @@
-"""The losses of discretised signed distances: projection, median, and the silhouette.
+"""The losses of discretised signed distances, the density control, and the recipe.
 
 ::
 
@@ -10,15 +10,29 @@ z is the depth of the projected centre ``x_0 = mu - s n``, and D the rendered de
 held constant in the derivatives. Between the centres of pixels, the inverse of D is interpolated.
 """
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.discretized_sdf.population import LOG_WIDTH
-from minisplat_ref.extensions.discretized_sdf.reference import projected, projected_vjp, reference_sharpness
+from minisplat_ref.extensions.discretized_sdf.model import (
+    LOG_WIDTH,
+    opacity_logits,
+    projected,
+    projected_vjp,
+    reference_sharpness,
+)
 from minisplat_ref.mechanisms.depth_maps.reprojection import sample_depth
+from minisplat_ref.mechanisms.gbuffer.training import NORMALS, SHADING_EVENTS
+from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS
+from minisplat_ref.mechanisms.surfels.losses import distortion
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, reset_opacity, reset_opacity_on_white
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import pinhole, pose, with_principal_point
-from minisplat_ref.training.losses import Cotangents, Rendered
+from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
+from minisplat_ref.training.schedule import During, Event, does
+from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats
 
 Z_MIN = 0.01  # world units: points nearer to the camera's plane have no pixel
@@ -91,3 +105,57 @@ def silhouette(rendered: Rendered) -> tuple[float, Cotangents]:
     value = -float(np.mean(np.where(mask, np.log(A), np.log1p(-A))))
     v = np.where(A == alpha, (A - mask) / (A * (1 - A)) / A.size, 0)
     return value, Cotangents(alpha=v.astype(alpha.dtype))
+
+
+def refresh_opacities(state: TrainState, iteration: Iteration) -> None:
+    """Write the opacities of the distances into the population, where other actions and files read them."""
+    g = state.gaussians
+    g.opacity_logits[:] = opacity_logits(g.distances, state.shared[LOG_WIDTH])
+
+
+def reset_distances(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
+    """Move centres away from the surface, without moving them, until no opacity is above ``ceiling``.
+
+    ``|s|`` becomes at least ``2 arsinh(exp(-l / 2)) / gamma`` with the logit l of the ceiling. Signs stay, and the
+    moments of the distances are forgotten, because they point back.
+    """
+    g, width = state.gaussians, np.exp(state.shared[LOG_WIDTH].astype(np.float64))
+    least = 2 * width * np.arcsinh(np.sqrt((1 - ceiling) / ceiling))
+    sign = np.where(g.distances < 0, -1, 1)
+    g.distances[:] = sign * np.maximum(np.abs(g.distances), least)
+    for moment in (state.adam.first, state.adam.second):
+        moment.distances[:] = 0
+    refresh_opacities(state, iteration)
+
+
+def reset_distances_on_white(state: TrainState, iteration: Iteration, *, ceiling: float) -> str | None:
+    """Do :func:`reset_distances` if the background is white, where early floaters hide best."""
+    if not np.all(iteration.scene.background == 1.0):
+        return "nothing done: the background is not white"
+    reset_distances(state, iteration, ceiling=ceiling)
+    return None
+
+
+def _of_distances(event: Event) -> Event:
+    """Return an event of surfels, with distances reset where it resets opacities."""
+    for action, own in ((reset_opacity, reset_distances), (reset_opacity_on_white, reset_distances_on_white)):
+        if does(event, action):
+            bound: Any = event.action
+            return event._replace(action=partial(own, **bound.keywords))
+    return event
+
+
+RECIPE = GS_ACCEL._replace(
+    name="discretized-sdf",
+    learning_rates=GS_ACCEL.learning_rates.change(opacity_logits=0.0),
+    losses=(
+        *GS_ACCEL.losses,
+        NORMALS._replace(weight=0.2),
+        LossTerm("distortion", distortion, 100.0, frozenset({"spread"}), start=3_000),
+        LossTerm("projection", partial(projection, reach=0.1), 1.0, frozenset({"depth"})),
+        LossTerm("median", median, 100.0, start=1_000),
+        LossTerm("silhouette", silhouette, 1e-3),
+    ),
+    events=(During(refresh_opacities), *map(_of_distances, DISC_EVENTS), *SHADING_EVENTS),
+)
+"""``discretized-sdf``: Ref-Gaussian's stages with the opacities of distances, and the losses on these."""

@@ -5,14 +5,14 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.gdgs.predictor import predict_centers
-from minisplat_ref.extensions.gdgs.reference import (
+from minisplat_ref.extensions.gdgs.model import (
     Regions,
     Weights,
     attract,
     contract,
     densest,
     disperse,
+    predict_centers,
     regions_of,
     unevenness,
 )

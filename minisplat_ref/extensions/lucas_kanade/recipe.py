@@ -1,10 +1,10 @@
-"""The two losses: flow against that of the photographs, and the order of depths.
+"""The two losses, flow against that of the photographs and the order of depths; their gradient check; the recipe.
 
 The flow of a view needs the camera and the time of the next photograph, which renderers do not have; so the term blends
 it itself, with the compositor of the backend, and returns derivatives with respect to the Gaussians and the warp.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import NamedTuple
@@ -13,26 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.lucas_kanade.moving import CENTERS, LOG_WIDTH, SHIFTS, Moved, moved, moved_vjp
+from minisplat_ref.extensions.lucas_kanade.model import CENTERS, LOG_WIDTH, SHIFTS, WARPED, Moved, moved, moved_vjp
 from minisplat_ref.extensions.lucas_kanade.pyramid import Flow, optical_flow
-from minisplat_ref.extensions.lucas_kanade.reference import (
-    Pairs,
-    Step,
-    flow_error,
-    flow_error_vjp,
-    image_steps,
-    image_steps_vjp,
-    order_error,
-    order_error_vjp,
-)
 from minisplat_ref.mechanisms.motion.field import field, field_vjp
 from minisplat_ref.mechanisms.motion.velocity import power_steps
-from minisplat_ref.reference.pinhole import pose, project_into_image, with_principal_point
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.models import TIME, noisy_model, training_view
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage, watch
+from minisplat_ref.reference.pinhole import pinhole, pinhole_vjp, pose, project_into_image, with_principal_point
 from minisplat_ref.rendering import Request, activate, parameters_vjp
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.rendering.splatting import SplatTape, splat, splat_vjp
-from minisplat_ref.training.losses import Cotangents, Rendered
-from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Scene, SHGradient, View
+from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Model, Scene, SHGradient, View
 
+SOFT = 0.1  # pixels: accuracy of the flow of photographs
 SHAPE = ("means", "quats", "log_scales", "opacity_logits")  # of a Gaussian: a flow does not depend on its colours
 NEAR = 0.01  # world units: points nearer to the second camera have no place in its image
 LONE_STEP = 1.0  # unit of time after which a scene of one photograph is taken to look the same
@@ -42,6 +39,75 @@ GAP = 0.02  # of the range of the given depths: pairs that differ by less have n
 
 
 # --- flow ---
+
+
+class Step(NamedTuple):
+    """Places before and after a step of time, each in the frame of the camera that sees it."""
+
+    before: Floats
+    """[N, 3]."""
+    after: Floats
+    """[N, 3]."""
+    cameras: tuple[Camera, Camera]
+
+
+def image_steps(before: Floats, after: Floats, cameras: tuple[Camera, Camera]) -> tuple[Floats, Step]:
+    """Return the motion of places in the image: ``pi'(R' x' + t') - pi(R x + t)``, [N, 2] in pixels.
+
+    Parameters
+    ----------
+    before, after : ndarray of shape (N, 3)
+        x and x', world frame, in front of their cameras.
+    cameras : pair of Camera
+        The cameras at both times.
+    """
+    poses = [pose(camera, before.dtype) for camera in cameras]
+    seen = [places @ R.T + t for places, (R, t) in zip((before, after), poses, strict=True)]
+    return pinhole(seen[1], cameras[1]) - pinhole(seen[0], cameras[0]), Step(seen[0], seen[1], cameras)
+
+
+def image_steps_vjp(step: Step, v: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`image_steps`: ``v_x = -R^T J^T v`` and ``v_x' = R'^T J'^T v``, J of the pinhole camera."""
+    (R, _), (R_after, _) = (pose(camera, v.dtype) for camera in step.cameras)
+    v_before, v_after = pinhole_vjp(step.before, step.cameras[0], v), pinhole_vjp(step.after, step.cameras[1], v)
+    return -v_before @ R, v_after @ R_after
+
+
+def flow_error(flow: Floats, alpha: Floats, target: Floats, is_known: Bools) -> float:
+    """Return the distance of a rendered flow from the given one, in image widths.
+
+    ::
+
+        L = sum_p rho(F_p - A_p f_p) / (P W)      over the P pixels at which f is known
+        rho(r) = sqrt(r_x^2 + e^2) + sqrt(r_y^2 + e^2) - 2 e
+
+    F is the blend ``sum_i w_i f_i`` of the Gaussians' motions in the image, and A the accumulated opacity, so that each
+    Gaussian contributes ``w_i (f_i - f)``: one that is faint is not compared with the whole motion. rho is the L1 norm
+    but for the kink at zero, which is round within e = SOFT pixels.
+
+    Parameters
+    ----------
+    flow : ndarray of shape (H, W, 2)
+        F, pixels.
+    alpha : ndarray of shape (H, W)
+        A.
+    target : ndarray of shape (H, W, 2)
+        f, pixels.
+    is_known : ndarray of shape (H, W) of booleans
+    """
+    residuals = (flow - alpha[..., None] * target)[is_known]
+    total = float(np.sum(np.hypot(residuals, residuals.dtype.type(SOFT)) - residuals.dtype.type(SOFT)))
+    return total / (max(len(residuals), 1) * flow.shape[1])
+
+
+def flow_error_vjp(flow: Floats, alpha: Floats, target: Floats, is_known: Bools) -> tuple[Floats, Floats]:
+    """Gradient of :func:`flow_error`: ``v_F = r / sqrt(r^2 + e^2) / (P W)``, r = F - A f, and ``v_A = -f . v_F``."""
+    unit = flow.dtype.type(1 / (max(np.count_nonzero(is_known), 1) * flow.shape[1]))
+    known = np.where(is_known[..., None], target, 0)
+    residuals = flow - alpha[..., None] * known
+    slopes = residuals / np.hypot(residuals, residuals.dtype.type(SOFT))
+    v_flow = np.where(is_known[..., None], unit * slopes, 0).astype(flow.dtype)
+    return v_flow, -np.sum(known * v_flow, axis=2)
 
 
 class FlowTape(NamedTuple):
@@ -263,6 +329,56 @@ def _read_map(path: Path, shape: tuple[int, ...], name: str) -> Floats:
 # --- depth ---
 
 
+class Pairs(NamedTuple):
+    """Pairs of pixels, the first of each nearer."""
+
+    near: Ints
+    """[Q, 2] row and column."""
+    far: Ints
+    """[Q, 2]."""
+
+
+def order_error(sums: Floats, alpha: Floats, pairs: Pairs, margin: float) -> float:
+    """Return the violation of the order in depth by pairs of pixels.
+
+    ::
+
+        L = mean max(0, m + ln d_near - ln d_far),   d = D / A
+
+    Only the order of the given depths counts, and only the ratio of the rendered ones: neither scale matters.
+
+    Parameters
+    ----------
+    sums : ndarray of shape (H, W)
+        D, the accumulated depth ``sum w z``.
+    alpha : ndarray of shape (H, W)
+        A, above 0 at these pixels.
+    pairs : Pairs
+    margin : float
+        m.
+    """
+    return float(np.sum(np.maximum(_excess(sums, alpha, pairs, margin), 0))) / max(len(pairs.near), 1)
+
+
+def order_error_vjp(sums: Floats, alpha: Floats, pairs: Pairs, margin: float) -> tuple[Floats, Floats]:
+    """Gradient of :func:`order_error`: ``v_D = +-1 / (Q D)`` and ``v_A = -+1 / (Q A)``, + at near pixels."""
+    v_sums, v_alpha = np.zeros_like(sums), np.zeros_like(alpha)
+    counts = _excess(sums, alpha, pairs, margin) > 0
+    for pixels, sign in ((pairs.near, 1), (pairs.far, -1)):
+        rows, columns = pixels[counts].T
+        weight = sums.dtype.type(sign / max(len(pairs.near), 1))
+        np.add.at(v_sums, (rows, columns), weight / sums[rows, columns])
+        np.add.at(v_alpha, (rows, columns), -weight / alpha[rows, columns])
+    return v_sums, v_alpha
+
+
+def _excess(sums: Floats, alpha: Floats, pairs: Pairs, margin: float) -> Floats:
+    """Return ``m + ln d_near - ln d_far``, [Q]."""
+    near, far = (np.log(sums[tuple(p.T)]) - np.log(alpha[tuple(p.T)]) for p in pairs)
+    excess: Floats = sums.dtype.type(margin) + near - far
+    return excess
+
+
 def depth_order(rendered: Rendered, *, depths: str, margin: float) -> tuple[float, Cotangents]:
     """Return the loss of pairs of pixels in the wrong order of depth, and its derivatives.
 
@@ -330,3 +446,44 @@ def _point_samples(rendered: Rendered) -> tuple[Ints, Floats]:
     camera = with_principal_point(view.camera, rendered.request.conventions)
     _, means2d, depths = project_into_image(scene.points[view.point_ids], camera)
     return np.floor(means2d[:, ::-1]).astype(np.int64), depths
+
+
+# --- the gradient check, and the recipe ---
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the flow as a function of the Gaussians and the warp."""
+    view = training_view(setting.camera)
+    camera = view.camera._replace(cam_from_world_t=view.camera.cam_from_world_t + np.array([0.1, -0.05, 0.1]))
+    other = view._replace(camera=camera, time=TIME + 0.4)
+    model, _ = noisy_model(setting, view, WARPED, rng)
+    fields = model.gaussians._asdict()
+    inputs = {**{name: fields[name] for name in SHAPE}, **model.shared}
+
+    def blend(args: tuple[Floats, ...], used: Backend) -> tuple[Floats, Floats, object]:
+        given = {**fields, **dict(zip(inputs, args, strict=True))}
+        moving = Model(model.gaussians._make(given[name] for name in fields), {n: given[n] for n in model.shared})
+        return rendered_flow(moving, view, other, Request(conventions=setting.conventions, backend=used))
+
+    def function(*args: Floats) -> Point:
+        on_watch, sides = watch(backend)
+        flow, alpha, _ = blend(args, on_watch)
+        return Point((flow, alpha), tuple(sides))
+
+    def vjp(v_flow: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
+        gaussians, shared = rendered_flow_vjp(blend(tuple(inputs.values()), backend)[2], v_flow, v_alpha)  # type: ignore[arg-type]
+        by_name = {**gaussians._asdict(), **shared}
+        return tuple(by_name[name] for name in inputs)
+
+    return (Stage("rendered_flow", inputs, ("flow", "alpha"), function, vjp),)
+
+
+LUCAS_KANADE = GS_ACCEL._replace(
+    name="lucas-kanade",
+    losses=(
+        *GS_ACCEL.losses,
+        LossTerm("flow", partial(flow, flows=""), 5.0),
+        LossTerm("depth_order", partial(depth_order, depths="", margin=0.01), 0.0, frozenset({"depth"})),
+    ),
+)
+"""``lucas-kanade``: 3DGS with a warp, and with a loss that compares its flow with that of the photographs."""
