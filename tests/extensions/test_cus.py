@@ -11,24 +11,28 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.cus import bank, maps
-from minisplat_ref.extensions.cus.decoding import decode
 from minisplat_ref.extensions.cus.gradient_checks import N_CHANNELS, small, stages
-from minisplat_ref.extensions.cus.losses import (
+from minisplat_ref.extensions.cus.memory import (
+    _read_map,
+    at_pixels,
+    feature_error,
+    feature_map,
+    first_keys,
+    read,
+    remember,
+)
+from minisplat_ref.extensions.cus.model import ANCHORS, CAMERAS, Anchors, as_anchors, decode
+from minisplat_ref.extensions.cus.recipe import (
     anchor_scale,
     blended_queries,
     blended_queries_vjp,
-    drawn_pixels,
-    feature_loss,
-    read_memory,
-)
-from minisplat_ref.extensions.cus.method import (
-    ANCHORS,
     contributions_of,
+    draw_pixels,
+    feature_loss,
     prune_insignificant,
+    read_memory,
     significance,
 )
-from minisplat_ref.extensions.cus.population import CAMERAS, Anchors, as_anchors
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image
@@ -251,36 +255,36 @@ def test_channels_are_blended_as_colors_are(rng):
 def test_what_is_remembered_by_hand():
     """Of cosines 0.6, 0.8 and 1 with what is kept before, those below 0.7 are new; length does not matter."""
     rows = np.array([[2.0, 0], [0.6, 0.8], [5, 0], [0.8, 0.6], [-1, 0], [0, 0]])
-    assert_allclose(bank.remember([rows], 0.7), [[2, 0], [0.6, 0.8], [-1, 0], [0, 0]])
-    assert_allclose(bank.remember([rows[:1], rows[1:]], 0.5), [[2, 0], [-1, 0], [0, 0]])
+    assert_allclose(remember([rows], 0.7), [[2, 0], [0.6, 0.8], [-1, 0], [0, 0]])
+    assert_allclose(remember([rows[:1], rows[1:]], 0.5), [[2, 0], [-1, 0], [0, 0]])
     many = np.random.default_rng(0).normal(size=(3000, 3))
-    kept = bank.remember([many], 0.9)
+    kept = remember([many], 0.9)
     units = kept / np.linalg.norm(kept, axis=1, keepdims=True)
     assert (np.triu(units @ units.T, 1) < 0.9).all()
     assert ((many @ units.T).max(axis=1) >= 0.9 * np.linalg.norm(many, axis=1) - 1e-12).all()
 
 
 def test_no_more_is_remembered_than_there_is_room_for(monkeypatch, rng):
-    monkeypatch.setattr(bank, "ROWS_MAX", 7)
-    assert bank.remember([rng.normal(size=(100, 4))], 1.0).shape == (7, 4)
+    monkeypatch.setattr("minisplat_ref.extensions.cus.memory.ROWS_MAX", 7)
+    assert remember([rng.normal(size=(100, 4))], 1.0).shape == (7, 4)
 
 
 def test_keys_have_a_mean_square_of_one(rng):
     memory = rng.normal(size=(40, 3)) @ np.diag([5, 0.1, 1.0])
-    keys = memory @ bank.first_keys(memory, 5)
+    keys = memory @ first_keys(memory, 5)
     assert_allclose(np.mean(keys**2, axis=0), [1, 1, 1, 0, 0], atol=1e-12)
-    assert_allclose(np.abs(bank.first_keys(np.ones((4, 2)), 2)), [[0.5, 0], [0.5, 0]], atol=1e-12)
+    assert_allclose(np.abs(first_keys(np.ones((4, 2)), 2)), [[0.5, 0], [0.5, 0]], atol=1e-12)
 
 
 def test_reading_by_hand():
     """A query of 2 ln 3 along one of two keys, of dimension 4: weights 3/4 and 1/4."""
     memory, keys = np.array([[1.0, 0], [0, 1]]), np.eye(2, 4)
     query = np.array([[2 * np.log(3), 0, 7, 0]])
-    found, _ = bank.read(query, memory, keys, np.array([[1.0, 0], [2, 1]]))
+    found, _ = read(query, memory, keys, np.array([[1.0, 0], [2, 1]]))
     assert_allclose(found, [[0.75 + 2 * 0.25, 0.25]], rtol=CLOSED_FORM)
-    value, _ = bank.feature_error(np.array([[0.0, 2]]), np.array([[3.0, 4]]))
+    value, _ = feature_error(np.array([[0.0, 2]]), np.array([[3.0, 4]]))
     assert_allclose(value, (9 + 4) / 2 + 1 - 0.8, rtol=1e-6)  # the floor of lengths
-    value, _ = bank.feature_error(np.array([[0.0, 2], [5, 0]]), np.array([[3.0, 4], [1, 0]]))
+    value, _ = feature_error(np.array([[0.0, 2], [5, 0]]), np.array([[3.0, 4], [1, 0]]))
     assert_allclose(value, (9 + 4 + 16) / 4 + 1 - (0.8 + 1) / 2, rtol=1e-6)
 
 
@@ -295,7 +299,7 @@ def test_classical_maps_are_where_the_photograph_is():
     """Along a ramp of one level per pixel the mean colour is that of the pixel, at every scale but for the borders."""
     ramp = np.tile(np.arange(100, dtype=np.uint8)[None, :, None], (60, 1, 3))
     for image, turn in ((ramp, False), (ramp.transpose(1, 0, 2), True)):
-        found = maps.feature_map(photograph(np.ascontiguousarray(image)), "")
+        found = feature_map(photograph(np.ascontiguousarray(image)), "")
         assert found.shape == (*image.shape[:2], 22) and found.dtype == np.float32
         found = found.transpose(1, 0, 2) if turn else found
         inside = (slice(None), slice(30, 70))
@@ -308,7 +312,7 @@ def test_classical_maps_know_the_direction_of_stripes():
     """Energies are channels 3 to 6 of the finest scale: the first is of waves along a row."""
     x = np.tile(np.arange(64), (48, 1))
     image = (255 * (0.5 + 0.5 * np.cos(2 * np.pi * x / 4.5)))[..., None].repeat(3, axis=2).astype(np.uint8)
-    row = maps.feature_map(photograph(image), "")[24, 20:44, 3:7]
+    row = feature_map(photograph(image), "")[24, 20:44, 3:7]
     assert (np.argmax(row, axis=1) == 0).all() and (row[:, 0] > 3 * row[:, 2]).all()
     assert np.ptp(row[:, 0]) < 0.2 * row[:, 0].mean()  # wherever in a stripe the pixel is
 
@@ -317,17 +321,17 @@ def test_cells_of_a_coarse_map():
     """Six columns of pixels over a map of two, and five rows over two: the middle is the second."""
     coarse = np.arange(4.0).reshape(2, 2, 1)
     pixels = np.array([[0, 0], [1, 2], [1, 3], [2, 2], [4, 5]])
-    assert maps.at_pixels(coarse, pixels, 5, 6)[:, 0].tolist() == [0, 0, 1, 2, 3]
+    assert at_pixels(coarse, pixels, 5, 6)[:, 0].tolist() == [0, 0, 1, 2, 3]
     middle = np.array([[0, 0], [0, 1], [1, 1]])  # of three columns over two, the middle one is the second's, too
-    assert maps.at_pixels(coarse, middle, 3, 3)[:, 0].tolist() == [0, 1, 3]
+    assert at_pixels(coarse, middle, 3, 3)[:, 0].tolist() == [0, 1, 3]
 
 
 def test_given_maps(tmp_path):
     array = np.arange(24.0).reshape(2, 3, 4)
     np.save(tmp_path / "a.npy", array)
     np.savez(tmp_path / "b.npz", features=array + 1)
-    assert_array_equal(maps.feature_map(photograph(np.zeros((18, 24, 3), np.uint8)), str(tmp_path)), array)
-    assert_array_equal(maps._read_map(tmp_path, "b"), array + 1)
+    assert_array_equal(feature_map(photograph(np.zeros((18, 24, 3), np.uint8)), str(tmp_path)), array)
+    assert_array_equal(_read_map(tmp_path, "b"), array + 1)
 
 
 def bad_maps(folder):
@@ -350,16 +354,16 @@ def bad_maps(folder):
 def test_bad_maps(name, message, tmp_path):
     bad_maps(tmp_path)
     with pytest.raises(InputError, match=message):
-        maps._read_map(tmp_path, name)
+        _read_map(tmp_path, name)
 
 
 def test_pixels_outside_a_mask_are_not_compared():
     view = photograph(np.zeros((18, 24, 3), np.uint8))
     mask = np.zeros((18, 24), bool)
     mask[3, 4:9] = True
-    assert drawn_pixels(view._replace(mask=mask), 100, 1).tolist() == [[3, x] for x in range(4, 9)]
-    drawn = drawn_pixels(view, 50, 1)
-    assert len(np.unique(drawn, axis=0)) == 50 and (drawn != drawn_pixels(view, 50, 2)).any()
+    assert draw_pixels(view._replace(mask=mask), 100, 1).tolist() == [[3, x] for x in range(4, 9)]
+    drawn = draw_pixels(view, 50, 1)
+    assert len(np.unique(drawn, axis=0)) == 50 and (drawn != draw_pixels(view, 50, 2)).any()
 
 
 # Losses and pruning
@@ -493,6 +497,6 @@ def test_maps_of_different_depth_are_refused(run_folder, tmp_path, capfd):
 
 
 def test_features_of_another_recipe_are_refused(run_folder, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr("minisplat_ref.extensions.cus.method.CUS", find_recipe("cus")._replace(name="other"))
+    monkeypatch.setattr("minisplat_ref.extensions.cus.recipe.CUS", find_recipe("cus")._replace(name="other"))
     assert main(["cus", "features", str(run_folder), "--out", str(tmp_path / "no")]) == 2
     assert "was trained by recipe cus, without features" in capfd.readouterr().err and not (tmp_path / "no").exists()

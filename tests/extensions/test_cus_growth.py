@@ -8,17 +8,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.cus import growth
-from minisplat_ref.extensions.cus.growth import (
+from minisplat_ref.extensions.cus.model import ANCHORS, as_anchors, at_rest, voxel_side
+from minisplat_ref.extensions.cus.recipe import (
     COUNT,
     SUM,
+    THRESHOLD,
     collect_gradients_of_children,
     find_candidates,
     grow,
     grow_anchors,
+    prune_insignificant,
 )
-from minisplat_ref.extensions.cus.method import ANCHORS, prune_insignificant
-from minisplat_ref.extensions.cus.population import as_anchors, at_rest, voxel_side
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU
@@ -182,7 +182,7 @@ def test_growth_is_by_the_mean_over_the_views_that_saw_a_gaussian(scene, state, 
         asked.append(gradients)
         return grow(anchors, np.zeros_like(gradients), side, 1.0, rng)
 
-    monkeypatch.setattr(growth, "grow", remembered)
+    monkeypatch.setattr("minisplat_ref.extensions.cus.recipe.grow", remembered)
     sums, counts = np.zeros((n, 2)), np.zeros((n, 2), int)
     sums[0, 0], counts[0, 0] = 3.0, 2
     state.stats |= {SUM: sums, COUNT: counts}
@@ -200,7 +200,7 @@ def test_dates_by_hand():
         next(i for i, event in enumerate(recipe.events) if does(event, action))
         for action in (prune_insignificant, grow_anchors)
     )
-    assert prune < grows and growth.THRESHOLD == 2e-4
+    assert prune < grows and THRESHOLD == 2e-4
 
 
 # A run

@@ -6,13 +6,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.cus import maps
-from minisplat_ref.extensions.cus.decoding import decode, decode_vjp
 from minisplat_ref.extensions.cus.gradient_checks import small
-from minisplat_ref.extensions.cus.growth import grow_anchors
-from minisplat_ref.extensions.cus.losses import blended_queries, feature_loss
-from minisplat_ref.extensions.cus.method import ANCHORS, prune_insignificant
-from minisplat_ref.extensions.cus.population import CAMERAS, MEMORY, UNITS, as_anchors
+from minisplat_ref.extensions.cus.memory import _read_map, feature_map, sample_rows
+from minisplat_ref.extensions.cus.model import ANCHORS, CAMERAS, MEMORY, UNITS, as_anchors, decode, decode_vjp
+from minisplat_ref.extensions.cus.recipe import (
+    blended_queries,
+    feature_loss,
+    grow_anchors,
+    prune_insignificant,
+    read_memory,
+)
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
@@ -151,26 +154,87 @@ def photograph(image):
 def test_maps_reach_both_borders(width):
     """A ramp and its mirror image have mirrored maps of colours, whatever the place of the last response."""
     ramp = np.tile((4 * np.arange(width)).astype(np.uint8)[None, :, None], (40, 1, 3))
-    found, mirrored = (maps.feature_map(photograph(image), "")[20] for image in (ramp, ramp[:, ::-1]))
+    found, mirrored = (feature_map(photograph(image), "")[20] for image in (ramp, ramp[:, ::-1]))
     for first in (0, 7, 14):
         assert_allclose(found[[0, -1], first], mirrored[[-1, 0], first], atol=0.01)
 
 
 def test_photographs_with_the_same_bytes_but_another_shape_have_other_maps():
     image = (np.arange(40 * 60 * 3) % 251).astype(np.uint8).reshape(40, 60, 3)
-    assert maps.feature_map(photograph(image), "").shape == (40, 60, 22)
-    assert maps.feature_map(photograph(image.reshape(60, 40, 3)), "").shape == (60, 40, 22)
+    assert feature_map(photograph(image), "").shape == (40, 60, 22)
+    assert feature_map(photograph(image.reshape(60, 40, 3)), "").shape == (60, 40, 22)
 
 
 def test_an_npy_comes_before_an_npz(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((1, 2, 3)))
     np.savez(tmp_path / "a.npz", features=np.zeros((1, 2, 3)))
-    assert maps._read_map(tmp_path, "a").sum() == 6
+    assert _read_map(tmp_path, "a").sum() == 6
 
 
 def test_features_are_sampled_without_replacement(rng):
     few = np.arange(24.0).reshape(3, 4, 2)
-    assert_array_equal(np.sort(maps.sample_rows(few, rng), axis=0), few.reshape(12, 2))
+    assert_array_equal(np.sort(sample_rows(few, rng), axis=0), few.reshape(12, 2))
     many = np.arange(50.0 * 50).reshape(50, 50, 1)
-    drawn = maps.sample_rows(many, rng)
+    drawn = sample_rows(many, rng)
     assert drawn.shape == (2_048, 1) and len(np.unique(drawn)) == 2_048 and drawn.max() > 2_048
+
+
+# The study
+
+
+def test_the_teacher_by_hand(made, rng):
+    """A label's direction, and 0.3 times the projected texture."""
+    teacher, view = study.make_teacher(rng), made.scene.train_views[0]
+    labels = object_ids(made.train_ids[0])
+    texture = feature_map(view, "")[5, 7] @ teacher.texture
+    expected = teacher.directions[labels[5, 7]] + 0.3 * texture
+    assert_allclose(teacher.features(view, labels)[5, 7], expected, rtol=1e-5)
+    assert_allclose(np.linalg.norm(teacher.directions, axis=1), 1)
+
+
+def test_prototypes_are_means_over_the_training_views(made, tmp_path):
+    task = study.make_task(made, 0, tmp_path)
+    stored = np.stack([np.load(tmp_path / f"{view.name}.npy") for view in made.scene.train_views])
+    labels = np.stack([object_ids(ids) for ids in made.train_ids])
+    label = labels[0, 0, 0]
+    assert_allclose(task.prototypes[label], stored[labels == label].mean(axis=0), rtol=1e-4)
+    assert len(task.targets) == len(task.labels) == len(made.scene.test_views)
+
+
+def test_floats_by_hand(rng):
+    """Two anchors of two Gaussians: centre, scale and colour, three numbers of latent and six of offsets, each."""
+    g = as_anchors(make_gaussians(rng, 2, sh_degree=0), rng, voxel=1e-3, children=2, latent=3)
+    shared = {"query_weights_0": np.zeros((4, 5)), "query_mix_biases_0": np.zeros(7), "memory": np.zeros((2, 2))}
+    assert study.counts(Model(g, shared)) == {"gaussians": 4, "all_floats": 2 * (9 + 3 + 6) + 20 + 7 + 4}
+    assert study.feature_floats(Model(g, shared)) == 2 * 3 + 20 + 7
+    assert study.counts(Model(make_gaussians(rng, 2, sh_degree=0))) == {"gaussians": 2, "all_floats": 28}
+
+
+def test_the_error_of_features_is_the_mean_over_views(made):
+    """A feature of length 1 that is found as zero has an error of 1/32, and a cosine of 0."""
+    scene = made.scene
+    labels = np.zeros((2, 3), np.int64)
+    target = np.zeros((2, 3, study.DIMENSION), np.float32)
+    target[..., 0] = 1
+    views = (scene.test_views[0], scene.train_views[0])
+    task = study.Task(scene._replace(test_views=views), "", [target, target], [labels, labels], np.eye(5, 32))
+    zero = np.zeros_like(target)
+    found = study.quality(task, lambda view: zero if view is views[0] else target)
+    assert_allclose(found["error"], (1 / 32 + 1) / 2, rtol=1e-5)
+
+
+def test_own_queries_learn(made, tmp_path):
+    """Forty iterations leave less than half of the error that one leaves."""
+    task = study.make_task(made, 0, tmp_path)
+    recipe = configure(find_recipe("cus"), **SMALL, features=str(tmp_path))
+    model = initial_state(made.scene, recipe, seed=0).model
+    errors = []
+    for iterations in (1, 40):
+        found = study.own_queries(model, task, 4, iterations, 0)
+
+        def features_of(view, found=found):
+            image, _ = study._blend(model, view, found["queries"])
+            return read_memory(image.reshape(-1, 4), found)[0].reshape(*image.shape[:2], -1)
+
+        errors.append(study.quality(task, features_of)["error"])
+    assert errors[1] < 0.5 * errors[0]

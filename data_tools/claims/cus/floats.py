@@ -29,12 +29,9 @@ from data_tools.claims.kit.figures import group, set_ticks, subplots, summarise
 from data_tools.claims.kit.objects import OBJECTS, mean_iou, object_ids
 from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
-from minisplat_ref.extensions.cus.bank import feature_error, first_keys, read_vjp
-from minisplat_ref.extensions.cus.decoding import decode
-from minisplat_ref.extensions.cus.losses import blended_queries, drawn_pixels, read_memory
-from minisplat_ref.extensions.cus.maps import feature_map
-from minisplat_ref.extensions.cus.method import ANCHORS, CUS, LATENT
-from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, QUERY, Anchors
+from minisplat_ref.extensions.cus.memory import feature_error, feature_map, first_keys, read_vjp
+from minisplat_ref.extensions.cus.model import ADAPTER, ANCHORS, KEYS, LATENT, MEMORY, QUERY, Anchors, decode
+from minisplat_ref.extensions.cus.recipe import CUS, blended_queries, draw_pixels, read_memory
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import BLUE, RED
 from minisplat_ref.mechanisms.features.blending import blend_channels, blend_channels_vjp
@@ -163,7 +160,7 @@ def own_queries(model: Model, task: Task, width: int, iterations: int, seed: int
     for step in range(1, iterations + 1):
         views = views or [task.scene.train_views[i] for i in rng.permutation(len(task.scene.train_views))]
         view = views.pop()
-        pixels = drawn_pixels(view, SAMPLES, step)
+        pixels = draw_pixels(view, SAMPLES, step)
         rows, columns = pixels.T
         image, tape = _blend(model, view, parameters["queries"])
         found, reading = read_memory(image[rows, columns], {MEMORY: memory, **parameters})

@@ -28,8 +28,8 @@ from data_tools.claims.cus.floats import (
 from data_tools.claims.kit.figures import group, mean_and_deviation, subplots
 from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.cus.growth import THRESHOLD, grow_anchors
-from minisplat_ref.extensions.cus.method import LATENT
+from minisplat_ref.extensions.cus.model import LATENT
+from minisplat_ref.extensions.cus.recipe import THRESHOLD, grow_anchors
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.training.schedule import Recipe, configure, without
 

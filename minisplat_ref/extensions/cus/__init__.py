@@ -2,22 +2,22 @@
 
 This follows CUS-GS, 2025, arXiv 2511.17904. 3DGS stores appearance for each Gaussian, and feature fields store features
 besides; here an anchor stores both for the K Gaussians of a voxel: a latent z of few numbers and their offsets.
-Networks that all anchors share make of it opacity, scales, rotation, colour and a query (:mod:`.decoding`):
+Networks that all anchors share make of it opacity, scales, rotation, colour and a query (:mod:`.model`):
 
     mu_n = m + dx_n,   (o, s, q, c)_n = networks(z, d, e),   k_n = [query(z, d, e), dx_n / s] A + b
 
 with the direction d of view and an embedding e of the photograph. Queries are blended as colours are, and a pixel reads
-its feature in a memory M of the photographs' features, each unlike the others (:mod:`.bank`):
+its feature in a memory M of the photographs' features, each unlike the others (:mod:`.memory`):
 
     f = softmax(k (M P)^T / sqrt(dim)) M W
 
 The loss is that of 3DGS, with 0.1 (L2 + 1 - cos) of the features and 0.01 times the mean volume of anchors
-(:mod:`.losses`). Every thousand iterations the 0.1 % of anchors with the least significance go (:mod:`.method`):
+(:mod:`.recipe`). Every thousand iterations the 0.1 % of anchors with the least significance go:
 
     S = 2 |z| + 8 |dL/dz| + sum_n hits_n o_n V_n
 
-Anchors are those of Scaffold-GS (Lu et al. 2023, arXiv 2312.00109), whose rule by which they grow is here, too
-(:mod:`.growth`). With ``growth_threshold=none`` they do not grow.
+Anchors are those of Scaffold-GS (Lu et al. 2023, arXiv 2312.00109), whose rule by which they grow is here, too.
+With ``growth_threshold=none`` they do not grow.
 
     minisplat-ref train SCENE --recipe cus --out runs/anchors
     minisplat-ref train SCENE --recipe cus --set features=DIR --out runs/anchors
@@ -28,7 +28,7 @@ Anchors are those of Scaffold-GS (Lu et al. 2023, arXiv 2312.00109), whose rule 
     minisplat-ref oracle gradients --extension cus
 
 ``features=DIR`` has a map for each photograph, ``NAME.npy`` or ``NAME.npz`` of [h, w, D], of whatever network; without
-it maps are classical: colours and the energies of Gabor filters at three scales, 22 numbers (:mod:`.maps`).
+it maps are classical: colours and the energies of Gabor filters at three scales, 22 numbers.
 ``docs/FAMILY.md`` has the measured figures. A run keeps networks, embeddings and memory in ``shared.npz``; a PLY has
 the anchors, which other viewers show as one Gaussian each.
 
@@ -47,7 +47,8 @@ from typing import Any
 
 from minisplat_ref.extensions.cus import features
 from minisplat_ref.extensions.cus.gradient_checks import stages
-from minisplat_ref.extensions.cus.method import ANCHORS, CUS
+from minisplat_ref.extensions.cus.model import ANCHORS
+from minisplat_ref.extensions.cus.recipe import CUS
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import save_ply

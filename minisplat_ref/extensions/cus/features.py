@@ -29,9 +29,8 @@ def run(args: argparse.Namespace) -> int:
     InputError
         It is no run of this recipe that has ended, or the folder exists.
     """
-    from minisplat_ref.extensions.cus.losses import blended_queries, read_memory
-    from minisplat_ref.extensions.cus.method import CUS
-    from minisplat_ref.extensions.cus.population import Anchors
+    from minisplat_ref.extensions.cus.model import Anchors
+    from minisplat_ref.extensions.cus.recipe import CUS, blended_queries, read_memory
     from minisplat_ref.io import viewpoints
     from minisplat_ref.io.atomic import making_folder
     from minisplat_ref.io.checkpoint import load_checkpoint

@@ -15,17 +15,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.cus.bank import feature_error, read, read_vjp
-from minisplat_ref.extensions.cus.decoding import decode
-from minisplat_ref.extensions.cus.losses import (
+from minisplat_ref.extensions.cus.memory import feature_error, read, read_vjp
+from minisplat_ref.extensions.cus.model import (
+    ADAPTER,
+    ANCHORS,
+    KEYS,
+    MEMORY,
+    MIX,
+    Anchors,
+    as_anchors,
+    decode,
+    initial_shared,
+)
+from minisplat_ref.extensions.cus.recipe import (
     FeatureTape,
     blended_queries,
     blended_queries_vjp,
     error_at_pixels,
     read_memory,
 )
-from minisplat_ref.extensions.cus.method import ANCHORS
-from minisplat_ref.extensions.cus.population import ADAPTER, KEYS, MEMORY, MIX, Anchors, as_anchors, initial_shared
 from minisplat_ref.mechanisms.networks.networks import IN_NUMPY
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage, noisy_model, training_view
@@ -148,17 +156,17 @@ def _movable(setting: Setting, rng: np.random.Generator, *unread: str) -> _Movab
 def _queries_stage(backend: Backend, setting: Setting, rng: np.random.Generator) -> Stage:
     movable = _movable(setting, rng, MEMORY, KEYS, ADAPTER)
 
-    def draw(model: Model, used: Backend) -> tuple[Floats, FeatureTape]:
+    def blend(model: Model, used: Backend) -> tuple[Floats, FeatureTape]:
         return blended_queries(model, movable.view, Request(conventions=setting.conventions, backend=used))
 
     def function(*args: Floats) -> Point:
         on_watch, sides = watch(backend)
         moved = movable.at(args)
-        image, _ = draw(moved, on_watch)
+        image, _ = blend(moved, on_watch)
         return Point((image,), (*sides, *_sides(moved, movable.view, with_queries=True)))
 
     def vjp(v_image: Floats) -> tuple[Floats, ...]:
-        anchors, shared = blended_queries_vjp(draw(movable.model, backend)[1], v_image)
+        anchors, shared = blended_queries_vjp(blend(movable.model, backend)[1], v_image)
         by_name = {**anchors._asdict(), **shared}
         return tuple(by_name[name] for name in movable.inputs)
 
@@ -171,8 +179,8 @@ def _loss_stage(backend: Backend, setting: Setting, rng: np.random.Generator) ->
     for name, factor in ((MEMORY, LONG), (KEYS, SHORT)):
         movable.inputs[name] = movable.model.shared[name][:] = factor * movable.model.shared[name]
     width, height = setting.camera.width, setting.camera.height
-    drawn = rng.choice(width * height, min(N_PIXELS, width * height), replace=False)
-    pixels = np.stack(np.divmod(drawn, width), axis=1)
+    chosen = rng.choice(width * height, min(N_PIXELS, width * height), replace=False)
+    pixels = np.stack(np.divmod(chosen, width), axis=1)
     image, _ = blended_queries(movable.model, movable.view, Request(conventions=setting.conventions))
     read_there, _ = read_memory(image[pixels[:, 0], pixels[:, 1]], movable.model.shared)
     wanted = read_there + NEAR * rng.normal(size=read_there.shape)
