@@ -74,20 +74,25 @@ def load_extension(name: str) -> Extension:
     found = folders()
     if name not in found:
         raise InputError(f"extension {name!r} does not exist: choose from {', '.join(found) or 'none'}")
+    return _load(name, found[name])
+
+
+def _load(name: str, folder: Path) -> Extension:
+    """Return the extension in a folder of those that :func:`folders` lists; raise as :func:`load_extension` does."""
     try:
         module = import_module(module_of(name))
     except (Exception, SystemExit) as error:  # whatever the user's file does
         reason = " ".join(str(error).split())
         raise InputError(
-            f"extension {name} in {found[name]} cannot be loaded, {type(error).__name__}: {reason}; mend or remove it"
+            f"extension {name} in {folder} cannot be loaded, {type(error).__name__}: {reason}; mend or remove it"
         ) from error
     extension = getattr(module, "EXTENSION", None)
     if not isinstance(extension, Extension):
         raise InputError(
-            f"extension {name} in {found[name]} has no EXTENSION that is an Extension: let its __init__.py say"
+            f"extension {name} in {folder} has no EXTENSION that is an Extension: let its __init__.py say"
             f' EXTENSION = Extension("{name}", ...)'
         )
-    _check_parts(extension, name, found[name])
+    _check_parts(extension, name, folder)
     return extension
 
 
@@ -140,9 +145,9 @@ def _takes_three(function: Callable[..., Any]) -> bool:
 def load_extensions() -> list[Extension]:
     """Return all extensions but those that cannot be loaded; stderr has one line about each of these, once."""
     extensions = []
-    for name in folders():
+    for name, folder in folders().items():
         try:
-            extensions.append(load_extension(name))
+            extensions.append(_load(name, folder))
         except InputError as error:
             if name not in _REPORTED:
                 print(f"minisplat-ref: warning: {' '.join(str(error).split())}", file=sys.stderr)

@@ -26,6 +26,7 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
 """
 
 import functools
+import gc
 import hashlib
 import os
 import platform
@@ -41,6 +42,7 @@ import llvmlite
 import numba
 import numpy as np
 from numba import prange
+from numba.core.event import Event, Listener, register
 from numba.extending import register_jitable
 
 __all__ = [
@@ -70,6 +72,30 @@ _PARALLEL = {  # only loops over prange, in their order, and nothing that Numba 
 }
 _KERNEL_FOLDERS = ("jit", "scalar", "cpu", "bench")
 _COMPILER_OPTIONS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
+
+
+class _WithoutCollection(Listener):
+    """Keeps the garbage collector from running while Numba compiles, which makes many small objects and drops few.
+
+    Numba reports the start and the end under its own lock, so that no two threads interleave here; the functions that
+    a function calls are compiled inside it.
+    """
+
+    def __init__(self) -> None:
+        self._was_enabled: list[bool] = []  # one for each function being compiled
+
+    def on_start(self, event: Event) -> None:
+        """Stop the collector."""
+        self._was_enabled.append(gc.isenabled())
+        gc.disable()
+
+    def on_end(self, event: Event) -> None:
+        """Start it again if it ran before; also called when a compilation fails."""
+        if self._was_enabled.pop():
+            gc.enable()
+
+
+register("numba:compile", _WithoutCollection())
 
 
 @functools.cache

@@ -5,7 +5,6 @@ several processes compile, and whatever runs later finds the kernels on disk. Th
 calls: :mod:`minisplat_ref.rendering.warm_up` for the stages, :mod:`minisplat_ref.extensions.warm_up` for all.
 """
 
-import gc
 import os
 import signal
 import threading
@@ -82,7 +81,6 @@ def _carry_out(task: Task, dtype: Dtype) -> Compiled:
 
 
 def _prepare_process() -> None:
-    gc.disable()  # the compiler makes many small objects, of which few can be freed
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -1,5 +1,6 @@
 """How kernels are run must not show in what they return: dtype, threads, compiled or not, fresh or from the cache."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
+from numba.core import event
 from numpy.testing import assert_allclose
 
 import minisplat_ref
@@ -31,6 +33,34 @@ from tolerances import COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMA
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 HELPERS = Path(__file__).parents[1] / "helpers"
+
+
+# --- compiling ---
+
+
+def test_no_garbage_is_collected_while_compiling():
+    """Nor while what a function calls is compiled; afterwards, and after an error, the collector runs as before."""
+    seen = []
+
+    class Watch(event.Listener):
+        def on_start(self, event):
+            seen.append(gc.isenabled())
+
+        def on_end(self, event):
+            pass
+
+    inner = numba.njit(lambda x: x + 1)
+    outer = numba.njit(lambda x: inner(x) + 1)
+    with event.install_listener("numba:compile", Watch()):
+        assert outer(1) == 3 and seen == [False, False] and gc.isenabled()
+        with pytest.raises(numba.TypingError):
+            outer("one")
+        assert len(seen) > 2 and not any(seen) and gc.isenabled()
+        gc.disable()
+        try:
+            assert outer(1.0) == 3.0 and not gc.isenabled()  # stopped before, stopped after
+        finally:
+            gc.enable()
 
 
 # --- dtype ---

@@ -57,8 +57,9 @@ def _write_part(first, end, projection, colors, alpha_min, records):
     count = list_visible(projection.radii, first, end, visible)
     for i in range(0, count, WIDTH):
         _write_eight(load_rows(visible, i), projection, colors, alpha_min, records)
-    for k in range(N_FUSED, colors.shape[1]):
-        records[first:end, COLOR + k] = colors[first:end, k]
+    for n in range(first, end):
+        for k in range(N_FUSED, colors.shape[1]):
+            records[n, COLOR + k] = colors[n, k]
 
 
 @kernel()
