@@ -14,7 +14,8 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
   name, and a process that loads both runs one of them twice. Therefore a function's name here includes what it closes
   over: functions by module and name, bundles of them field by field, numbers by type and value, nothing by its address.
 * Two processes that save to Numba's cache at the same moment take the same file name, and later processes load the
-  wrong kernel. Saving is therefore one process at a time.
+  wrong kernel. Saving is therefore one process at a time. So is compiling one kernel, which takes seconds: processes
+  that need the same wait for the first and load what it saved.
 * Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
   kernels share one lock.
 * ``fastmath=True`` would let the compiler assume that there are no NaN, and ``isnan`` return False. Kernels may only
@@ -28,15 +29,17 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
 import functools
 import gc
 import hashlib
+import math
 import os
 import platform
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, ModuleType
-from typing import Any
+from typing import IO, Any
 
 import llvmlite
 import numba
@@ -65,6 +68,7 @@ if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 _KERNEL_LOCK = threading.RLock()
+_COMPILING = ExitStack()  # contains the lock of the kernel that is being compiled; guarded by the lock of all kernels
 _PACKAGE = Path(__file__).parent.parent
 _PARALLEL = {  # only loops over prange, in their order, and nothing that Numba parallelises on its own
     "prange": True,
@@ -193,29 +197,52 @@ def _folder_of_module(module: str) -> str:
 
 
 @contextmanager
-def _one_process_at_a_time(folder: str) -> Iterator[None]:
-    """Hold a lock on the cache; the system releases it when the file is closed, however the process ends."""
+def _one_process_at_a_time(folder: str, name: str = "lock", patience: float = math.inf) -> Iterator[None]:
+    """Hold a lock on the cache, or on one kernel; the system releases it when the file is closed, however that happens.
+
+    After ``patience`` seconds the process goes on without: another one may hold the lock and be suspended.
+    """
     Path(folder).mkdir(parents=True, exist_ok=True)  # the cache may have been cleared
-    with open(Path(folder) / "lock", "a+b") as file:
-        if os.name == "nt":
-            import msvcrt
-
-            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # type: ignore[attr-defined]  # exists on Windows only
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
+    with open(Path(folder) / name, "a+b") as file:
+        end = time.monotonic() + patience
+        while not _lock(file) and time.monotonic() < end:
+            time.sleep(0.01)
         yield
 
 
-def _save_alone(compiled: Any, folder: str) -> None:
-    """Make a compiled function save itself to the cache under the lock."""
-    save = compiled._cache.save_overload
+def _lock(file: IO[bytes]) -> bool:
+    """Lock a file if no other process has locked it; return whether it is locked now."""
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]  # exists on Windows only
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    return True
+
+
+def _share_work(compiled: Any, folder: str) -> None:
+    """Let one process compile a kernel, for which others wait, and save it under the lock of the cache."""
+    load, save = compiled._cache.load_overload, compiled._cache.save_overload
+
+    def load_overload(signature: Any, context: Any) -> Any:
+        found = load(signature, context)
+        if found is None:
+            _COMPILING.enter_context(_one_process_at_a_time(folder, f"{compiled._cache._impl.filename_base}.lock", 60))
+            found = load(signature, context)  # another process may just have saved it
+        return found
 
     def save_overload(signature: Any, result: Any) -> None:
         with _one_process_at_a_time(folder):
             save(signature, result)
+        _COMPILING.close()
 
+    compiled._cache.load_overload = load_overload
     compiled._cache.save_overload = save_overload
 
 
@@ -293,11 +320,11 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
         if folder is not None and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # then it is plain Python
-            _save_alone(compiled, folder)
+            _share_work(compiled, folder)
 
         @functools.wraps(function)
         def locked(*args: Any) -> Any:
-            with _KERNEL_LOCK:
+            with _KERNEL_LOCK, _COMPILING:
                 return compiled(*args)
 
         return locked

@@ -198,7 +198,7 @@ def test_the_cache_has_one_writer_at_a_time(tmp_path):
 def test_kernels_are_saved_under_the_lock(tmp_path, monkeypatch):
     locked = []
     monkeypatch.setattr(_jit, "cache_folder", lambda function: str(tmp_path))
-    monkeypatch.setattr(_jit, "_one_process_at_a_time", lambda folder: nullcontext(locked.append(folder)))
+    monkeypatch.setattr(_jit, "_one_process_at_a_time", lambda *of: nullcontext(locked.append(of[:2])))
 
     @_jit.kernel(parallel=False)
     def doubled(values):
@@ -209,7 +209,65 @@ def test_kernels_are_saved_under_the_lock(tmp_path, monkeypatch):
         values = np.ones(3, dtype)
         doubled(values)
         assert (values == 2).all()
-    assert locked == [str(tmp_path)] * 2 and len(list(tmp_path.rglob("*.nbc"))) == 2
+    assert [folder for folder, *_ in locked] == [str(tmp_path)] * 4 and len(list(tmp_path.rglob("*.nbc"))) == 2
+    assert [len(names) for _, *names in locked] == [1, 0] * 2  # one to compile it, and another to save it
+
+
+def test_a_kernel_that_another_process_compiles_is_awaited_and_loaded(tmp_path, monkeypatch):
+    folders, compiled = [str(tmp_path / name) for name in ("theirs", "ours")], []
+
+    def make(folder):
+        monkeypatch.setattr(_jit, "cache_folder", lambda function: folder)
+
+        @_jit.kernel(parallel=False)
+        def doubled(values):
+            for i in range(values.size):
+                values[i] *= 2
+
+        return doubled
+
+    class Watch(event.Listener):
+        def on_start(self, event):
+            compiled.append(event.data["dispatcher"])
+
+        def on_end(self, event):
+            pass
+
+    def wait(folder, name="", patience=0.0):
+        if folder == folders[1] and name:
+            shutil.copytree(*folders, dirs_exist_ok=True)
+        return nullcontext()
+
+    monkeypatch.setattr(_jit, "_one_process_at_a_time", wait)
+    theirs, ours = map(make, folders)
+    values = np.ones(3)
+    with event.install_listener("numba:compile", Watch()):
+        theirs(values)
+        assert len(compiled) == 1
+        ours(values)
+        assert len(compiled) == 1 and (values == 4).all()
+
+
+def test_a_suspended_process_holds_nobody_up_for_ever(tmp_path):
+    with _jit._one_process_at_a_time(str(tmp_path), "f.lock"):
+        with _jit._one_process_at_a_time(str(tmp_path), "f.lock", patience=0.05), open(tmp_path / "f.lock") as file:
+            assert not _jit._lock(file)
+    with open(tmp_path / "f.lock") as file:
+        assert _jit._lock(file)
+
+
+def test_a_kernel_that_does_not_compile_is_released(tmp_path, monkeypatch):
+    monkeypatch.setattr(_jit, "cache_folder", lambda function: str(tmp_path))
+
+    @_jit.kernel(parallel=False)
+    def wrong(values):
+        values.nothing()
+
+    with pytest.raises(numba.TypingError):
+        wrong(np.ones(3))
+    (path,) = tmp_path.glob("*.lock")
+    with open(path) as file:
+        assert _jit._lock(file)
 
 
 def test_a_function_is_named_after_what_it_closes_over():
