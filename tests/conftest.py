@@ -1,11 +1,15 @@
 """Fixtures for all test files."""
 
+import gc
 import os
 
 # The workers of pytest-xdist and the processes that tests start share the cores. A thread that spins while it waits for
 # work keeps another process from running: small trainings take four times the processor time. So the threads of OpenMP
 # sleep, and NumPy's matrix products have one. Both libraries read this once, when they are loaded.
 os.environ |= {"GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1"}
+# Processes that tests start find sources compiled; otherwise each compiles all that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+gc.disable()  # until all is imported and collected, which stays
 
 import signal
 from functools import partial
@@ -20,6 +24,12 @@ from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.rendering.backends import BACKENDS, CPU, REFERENCE
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_collection_finish():
+    """Let the garbage collector run again, but never over the thousands of items and what their modules imported."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

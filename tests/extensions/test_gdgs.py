@@ -198,7 +198,7 @@ def test_repulsion_reaches_an_eighth_of_a_region():
 def test_the_recipe_trains_through_the_command_line(tmp_path):
     tiny = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *tiny]) == 0
-    train = ["train", str(tmp_path / "room"), "--recipe", "gdgs", "--iterations", "40", "--out", str(tmp_path / "run")]
+    train = ["train", str(tmp_path / "room"), "--recipe", "gdgs", "--iterations", "10", "--out", str(tmp_path / "run")]
     assert main([*train, "--set", "period=1", "--set", "contraction=0.001"]) == 0
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["n_gaussians"] > 0
     names = {action_name(event) for event in find_recipe("gdgs").events}
