@@ -47,7 +47,7 @@ class Shot(NamedTuple):
     output: RenderOutput
 
 
-class Asked(NamedTuple):
+class Settings(NamedTuple):
     """The request besides the scene: the cameras, with their lenses, and the options of rendering."""
 
     cameras: tuple[Camera, ...]
@@ -120,16 +120,16 @@ def rasterization(
     """
     batch = _check(scene, Views(viewmats, Ks, width, height))
     lens = (camera_model, radial_coeffs, tangential_coeffs, with_ut, with_eval3d)
-    asked = _ask(batch, lens, backend, conventions, steps)
+    settings = _read_settings(batch, lens, backend, conventions, steps)
     outputs: list[RenderOutput] = []
     metas: list[dict[str, Any]] = []
-    for c in range(len(asked.cameras)):
-        if asked.is_parallel:
-            tape = _shoot_parallel(batch, c, asked)
+    for c in range(len(settings.cameras)):
+        if settings.is_parallel:
+            tape = _shoot_parallel(batch, c, settings)
             outputs.append(tape.output)
             metas.append({name: getattr(tape.projection, name) for name in ("radii", "means2d", "depths")})
         else:
-            shot = _shoot(batch, c, asked, steps)
+            shot = _shoot(batch, c, settings, steps)
             outputs.append(shot.output)
             f = shot.footprints
             metas.append({"radii": f.radii, "means2d": _unscented_means(f), "depths": f.depths})
@@ -166,19 +166,19 @@ def rasterization_vjp(
     """
     batch = _check(scene, Views(viewmats, Ks, width, height))
     lens = (camera_model, radial_coeffs, tangential_coeffs, with_ut, with_eval3d)
-    asked = _ask(batch, lens, backend, conventions, steps)
+    settings = _read_settings(batch, lens, backend, conventions, steps)
     given = {f"v_{name}": np.zeros_like(field) for name, field in batch.primitives._asdict().items()}
     given |= {"v_colors": np.zeros_like(batch.colors), "v_backgrounds": np.zeros_like(batch.backgrounds)}
-    given["v_viewmats"] = np.zeros((len(asked.cameras), 4, 4), batch.colors.dtype)
-    for c, camera in enumerate(asked.cameras):
+    given["v_viewmats"] = np.zeros((len(settings.cameras), 4, 4), batch.colors.dtype)
+    for c, camera in enumerate(settings.cameras):
         v_output = np.asarray(v_render_colors)[c], np.asarray(v_render_alphas)[c, ..., 0]
-        if asked.is_parallel:
-            v = splat_vjp(_shoot_parallel(batch, c, asked), *v_output)
+        if settings.is_parallel:
+            v = splat_vjp(_shoot_parallel(batch, c, settings), *v_output)
             v_primitives, v_colors, v_background = v.primitives, v.colors, v.background
             F = np.array([camera.fx, camera.fy, 1.0])
             v_R, v_t = F[:, None] * v_primitives.cam_from_world_R, F * v_primitives.cam_from_world_t
         else:
-            v_primitives, v_colors, v_background = _shoot_vjp(batch, c, asked, steps, v_output)
+            v_primitives, v_colors, v_background = _shoot_vjp(batch, c, settings, steps, v_output)
             v_R, v_t = v_primitives.cam_from_world_R, v_primitives.cam_from_world_t
         for name in batch.primitives._fields:
             given[f"v_{name}"] += getattr(v_primitives, name)
@@ -201,13 +201,13 @@ def _check(scene: Mapping[str, Any], views: Views) -> Batch:
     return check_batch((means, quats, scales, opacities), views, scene["colors"], scene.get("backgrounds"), options)
 
 
-def _ask(
+def _read_settings(
     batch: Batch,
     lens: tuple[str, Floats | None, Floats | None, bool, bool],
     backend: str | Backend,
     conventions: Conventions,
     steps: Steps,
-) -> Asked:
+) -> Settings:
     """Return the request, checked."""
     model, radial, tangential, *flags = lens
     stages = get_backend(backend) if isinstance(backend, str) else backend
@@ -216,7 +216,7 @@ def _ask(
             raise InputError("camera_model='ortho' has no distortion: leave out radial_coeffs and tangential_coeffs")
         if any(flags):
             raise InputError("camera_model='ortho' is drawn by conics, which are exact: leave out with_ut, with_eval3d")
-        return Asked(batch.cameras, True, conventions, stages)
+        return Settings(batch.cameras, True, conventions, stages)
     if model not in N_RADIAL:
         raise InputError(f"camera_model={model!r} is not computed: choose from {', '.join(N_RADIAL)}, ortho")
     if not all(flags):
@@ -227,7 +227,7 @@ def _ask(
         raise InputError("a fisheye has no tangential_coeffs: leave them out")
     is_bare = model == "pinhole" and radial is None and tangential is None
     bent = [steps.bend(camera, model, k[c], p[c]) for c, camera in enumerate(batch.cameras)]
-    return Asked(batch.cameras if is_bare else tuple(bent), False, conventions, stages)
+    return Settings(batch.cameras if is_bare else tuple(bent), False, conventions, stages)
 
 
 def _coefficients(name: str, value: Floats | None, n_cameras: int, n: int) -> list[list[float]]:
@@ -248,31 +248,31 @@ def _unscented_means(f: LensFootprints) -> Floats:
     return found
 
 
-def _shoot(batch: Batch, c: int, asked: Asked, steps: Steps) -> Shot:
+def _shoot(batch: Batch, c: int, settings: Settings, steps: Steps) -> Shot:
     """Render one camera along its rays."""
-    camera, colors = asked.cameras[c], batch.colors_of(c)
-    footprints = steps.project(batch.primitives, camera, asked.conventions)
-    bins = list_tiles(footprints, camera, asked.backend, asked.conventions)
-    inputs = footprints, colors, batch.backgrounds[c], bins, asked.conventions
+    camera, colors = settings.cameras[c], batch.colors_of(c)
+    footprints = steps.project(batch.primitives, camera, settings.conventions)
+    bins = list_tiles(footprints, camera, settings.backend, settings.conventions)
+    inputs = footprints, colors, batch.backgrounds[c], bins, settings.conventions
     blend: Callable[..., RenderOutput] = (
         partial(kernel_hits.composite_hits, response_for(colors.dtype))
-        if asked.backend.is_compiled
+        if settings.backend.is_compiled
         else partial(composite_hits, RESPONSE)
     )
     return Shot(footprints, blend(*inputs))
 
 
 def _shoot_vjp(
-    batch: Batch, c: int, asked: Asked, steps: Steps, v_output: tuple[Floats, Floats]
+    batch: Batch, c: int, settings: Settings, steps: Steps, v_output: tuple[Floats, Floats]
 ) -> tuple[PrimitiveGradient, Floats, Floats]:
     """Gradient of :func:`_shoot`: of Gaussians and pose, colours [N, D] and background [D]."""
-    shot, colors = _shoot(batch, c, asked, steps), batch.colors_of(c)
-    f, conventions = shot.footprints, asked.conventions
-    bins = list_tiles(f, asked.cameras[c], asked.backend, conventions)
+    shot, colors = _shoot(batch, c, settings, steps), batch.colors_of(c)
+    f, conventions = shot.footprints, settings.conventions
+    bins = list_tiles(f, settings.cameras[c], settings.backend, conventions)
     inputs = f, colors, batch.backgrounds[c], bins, conventions, shot.output, v_output
     blend_vjp = (
         partial(kernel_hits.composite_hits_vjp, response_for(colors.dtype))
-        if asked.backend.is_compiled
+        if settings.backend.is_compiled
         else partial(composite_hits_vjp, RESPONSE)
     )
     v = blend_vjp(*inputs)
@@ -282,12 +282,12 @@ def _shoot_vjp(
     return v_primitives, v.colors, v.background
 
 
-def _shoot_parallel(batch: Batch, c: int, asked: Asked) -> SplatTape:
+def _shoot_parallel(batch: Batch, c: int, settings: Settings) -> SplatTape:
     """Render one camera with parallel rays."""
     colors = batch.colors_of(c)
 
     def shade(radii: Ints) -> Floats:
         return colors
 
-    affine = with_affine(asked.backend, orthographic)
-    return splat(batch.primitives, shade, asked.cameras[c], batch.backgrounds[c], asked.conventions, affine)
+    affine = with_affine(settings.backend, orthographic)
+    return splat(batch.primitives, shade, settings.cameras[c], batch.backgrounds[c], settings.conventions, affine)

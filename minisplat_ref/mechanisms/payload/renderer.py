@@ -120,7 +120,7 @@ def carry_depths_vjp(footprints: Any, wants: frozenset[str], v_carried: Floats) 
 
 
 class Appearance(NamedTuple):
-    """How opacities and colours are made of what a population stores; by default as in 3DGS."""
+    """Functions from the fields of a population to opacities and colours; by default those of 3DGS."""
 
     opacity_logits: Callable[[Any], Floats] = stored_logits
     """Return the logits [N] of the opacities that are projected."""
@@ -154,17 +154,17 @@ class Payload(NamedTuple):
     is_plain: Callable[[Any], bool]
     """Return whether a population has no payload, so that 3DGS renders it."""
     footprints: Callable[[Projected], Any]
-    """Return what the responses take. Its field ``projection`` says what is seen: the ellipses', or more or less."""
+    """Return what the responses take. Its field ``projection`` holds what is seen: the ellipses', or more or less."""
     footprints_vjp: Callable[[Projected, tuple[Floats, ...]], PayloadGradient]
     """Return the gradient of ``footprints`` for that of the response's fields after the conic's."""
     listed: Callable[[Any], Projection] = projection_alone
-    """Return, of the footprints, by what tiles are listed: ellipses that hold all that is drawn, in their boxes."""
+    """Return the projection by which tiles are listed: ellipses that hold all that is rendered, in their boxes."""
     appearance: Appearance = Appearance()
     carried: Carried = Carried()
 
 
 class PayloadTape(NamedTuple):
-    """What the renderer keeps for its gradient."""
+    """The values that the renderer keeps for its gradient."""
 
     payload: Payload
     projected: Projected

@@ -492,7 +492,7 @@ def _triangles_vjp(vertices, faces, rgba, fragments, v_shades, v_corners, v_corn
 
 
 def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
-    """Draw a mesh; see ``mechanisms.peeling.reference.peel``."""
+    """Render a mesh; see ``mechanisms.peeling.reference.peel``."""
     camera, dtype = frame.camera, mesh.vertices.dtype
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     vertices = mesh.vertices.astype(np.float64) @ R.T + t

@@ -47,7 +47,7 @@ class Tape(NamedTuple):
 
 
 def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
-    """Draw a mesh.
+    """Render a mesh.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ STEPS = Steps()
 """Those of gsplat."""
 
 
-class Asked(NamedTuple):
+class Settings(NamedTuple):
     """The request of a call besides the options of every call."""
 
     has_distortion: bool
@@ -138,11 +138,11 @@ def rasterization_2dgs(
     InputError
         If an argument has a wrong shape, dtype or value, or requests something that is not computed.
     """
-    asked = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
+    settings = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
     options = Options(sh_degree, render_mode, False, tile_size, radius_clip)
     views = Views(viewmats, Ks, width, height)
     lead, batches = split_batches((means, quats, scales, opacities), None, colors, views, backgrounds, options)
-    shown = [_render_one(batch, c, asked) for batch in batches for c in range(len(batch.cameras))]
+    shown = [_render_one(batch, c, settings) for batch in batches for c in range(len(batch.cameras))]
     front = (*lead, len(batches[0].cameras))
     images = [
         np.stack(image).reshape(*front, *image[0].shape) for image in zip(*(s.images for s in shown), strict=True)
@@ -200,7 +200,7 @@ def rasterization_2dgs_vjp(
         ``v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmats``, and ``v_backgrounds`` where there are some,
         in the shapes of the arguments. The third scale's are 0.
     """
-    asked = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
+    settings = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
     options = Options(sh_degree, render_mode, False, tile_size, radius_clip)
     views = Views(viewmats, Ks, width, height)
     lead, batches = split_batches((means, quats, scales, opacities), None, colors, views, backgrounds, options)
@@ -210,7 +210,7 @@ def rasterization_2dgs_vjp(
     found = []
     for index, batch in zip(np.ndindex(lead), batches, strict=True):
         own = {name: np.asarray(v)[index] if lead else np.asarray(v) for name, v in cotangents.items()}
-        found.append(_batch_vjp(batch, own, asked))
+        found.append(_batch_vjp(batch, own, settings))
     names = [name for name in GRADIENTS if not (name == "v_backgrounds" and backgrounds is None)]
     return {name: np.stack([f[name] for f in found]).reshape(*lead, *found[0][name].shape) for name in names}
 
@@ -224,7 +224,7 @@ def _check(
     backend: str | Backend,
     steps: Steps,
     others: dict[str, Any],
-) -> Asked:
+) -> Settings:
     """Return the request besides the options, checked.
 
     Raises
@@ -244,16 +244,16 @@ def _check(
         raise InputError("distloss needs a depth: give render_mode D, ED, RGB+D or RGB+ED")
     conventions = check.choose_conventions(GSPLAT_1_5, near_plane, far_plane, None, "classic")
     stages = get_backend(backend) if isinstance(backend, str) else backend
-    return Asked(distloss, depth_mode == "median", conventions, stages, steps)
+    return Settings(distloss, depth_mode == "median", conventions, stages, steps)
 
 
-def _render_one(batch: Batch, c: int, asked: Asked) -> OneView:
+def _render_one(batch: Batch, c: int, settings: Settings) -> OneView:
     """Render view c by gsplat's rules."""
-    camera, options, conventions, steps = batch.cameras[c], batch.options, asked.conventions, asked.steps
+    camera, options, conventions, steps = batch.cameras[c], batch.options, settings.conventions, settings.steps
     primitives, dtype = batch.primitives, batch.primitives.means.dtype
     rules = GSPLAT._replace(tile_size=options.tile_size)
     surfels = steps.project(primitives, camera, conventions, rules, options.radius_clip)
-    channels = [_colors(batch, c, asked, surfels.radii)] if options.has_colors else []
+    channels = [_colors(batch, c, settings, surfels.radii)] if options.has_colors else []
     if options.has_depth:
         channels.append(surfels.depths[:, None])
     n_colors = sum(part.shape[1] for part in channels)
@@ -263,7 +263,7 @@ def _render_one(batch: Batch, c: int, asked: Asked) -> OneView:
         background[: batch.backgrounds.shape[1]] = batch.backgrounds[c]
     read = surfels._replace(depths=values[:, n_colors - 1].astype(np.float64))  # as gsplat does: the last channel
     bins = list_tiles(surfels, camera, conventions, REFERENCE)
-    shown = Shown(read, values, background, bins, conventions, asked.backend, Layout())
+    shown = Shown(read, values, background, bins, conventions, settings.backend, Layout())
     blended, measures = steps.blend(shown), steps.measure(shown)
     image, normals = blended.image[..., :n_colors].copy(), blended.image[..., n_colors:]
     if options.has_expected_depth:
@@ -271,9 +271,9 @@ def _render_one(batch: Batch, c: int, asked: Asked) -> OneView:
     to_world = np.linalg.inv(camera.cam_from_world_R).T.astype(dtype)  # of rows
     surface = np.zeros_like(normals)
     if options.has_colors and options.has_depth:
-        depth = measures.median.astype(dtype) if asked.reads_median else image[..., -1]
+        depth = measures.median.astype(dtype) if settings.reads_median else image[..., -1]
         surface = _unit(steps.normals_of(depth, camera) @ camera.cam_from_world_R.astype(dtype))
-    distortion = measures.distortion.astype(dtype) if asked.has_distortion else np.zeros_like(blended.alpha)
+    distortion = measures.distortion.astype(dtype) if settings.has_distortion else np.zeros_like(blended.alpha)
     columns = (blended.alpha, distortion, measures.median.astype(dtype))
     alpha, distortion, median = (column[..., None] for column in columns)
     return OneView(
@@ -286,16 +286,16 @@ def _unit(vectors: Floats) -> Floats:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), LENGTH_MIN)
 
 
-def _colors(batch: Batch, c: int, asked: Asked, radii: Ints) -> Floats:
+def _colors(batch: Batch, c: int, settings: Settings, radii: Ints) -> Floats:
     """Return the colours [N, D] that camera c sees."""
     colors = batch.colors_of(c)
     if batch.options.sh_degree is None:
         return colors
     camera, degree = remove_rotation(batch.cameras[c]), batch.options.sh_degree
-    return asked.backend.sh_colors(batch.primitives.means, colors[:, 0], colors[:, 1:], camera, degree, radii)
+    return settings.backend.sh_colors(batch.primitives.means, colors[:, 0], colors[:, 1:], camera, degree, radii)
 
 
-def _batch_vjp(batch: Batch, cotangents: dict[str, Floats], asked: Asked) -> dict[str, Floats]:
+def _batch_vjp(batch: Batch, cotangents: dict[str, Floats], settings: Settings) -> dict[str, Floats]:
     """Gradient of the views of one scene."""
     dtype, C = batch.primitives.means.dtype, len(batch.cameras)
     v = {
@@ -305,7 +305,7 @@ def _batch_vjp(batch: Batch, cotangents: dict[str, Floats], asked: Asked) -> dic
         "v_backgrounds": np.zeros_like(batch.backgrounds),
     }
     for c in range(C):
-        view = _render_one(batch, c, asked)
+        view = _render_one(batch, c, settings)
         v_images = []
         for name, image in zip(NAMES, view.images, strict=True):
             given = cotangents.get(f"v_{name}")
@@ -313,12 +313,12 @@ def _batch_vjp(batch: Batch, cotangents: dict[str, Floats], asked: Asked) -> dic
             if given is not None and np.shape(given) != shape:
                 raise InputError(f"v_{name} has shape {list(np.shape(given))}; it must be {list(shape)}")
             v_images.append(np.zeros_like(image) if given is None else np.asarray(given[c], dtype))
-        _add_view_vjp(v, batch, c, asked, view, v_images)
+        _add_view_vjp(v, batch, c, settings, view, v_images)
     return v
 
 
 def _add_view_vjp(
-    v: dict[str, Floats], batch: Batch, c: int, asked: Asked, view: OneView, v_images: list[Floats]
+    v: dict[str, Floats], batch: Batch, c: int, settings: Settings, view: OneView, v_images: list[Floats]
 ) -> None:
     """Add the gradient of view c to ``v``: the chain rule over the steps of :func:`_render_one` in reverse.
 
@@ -326,19 +326,19 @@ def _add_view_vjp(
     the surface are unit vectors along ``R^T n``, because gsplat takes the cross product in the world. Spherical
     harmonics add, via the camera's centre ``o = -R^-1 t``, ``v_R = -u o^T`` and ``v_t = -u`` with ``u = R^-T v_o``.
     """
-    camera, options, steps, dtype = batch.cameras[c], batch.options, asked.steps, batch.primitives.means.dtype
+    camera, options, steps, dtype = batch.cameras[c], batch.options, settings.steps, batch.primitives.means.dtype
     v_image, v_alpha, v_normals, v_surface, v_distortion, v_median = v_images
     R, n_colors = camera.cam_from_world_R.astype(dtype), v_image.shape[2]
     v_normals = v_normals @ np.linalg.inv(R)  # in the camera's frame
     v_image, v_alpha, v_median = v_image.copy(), v_alpha[..., 0], v_median[..., 0]
     v_R = np.zeros((3, 3), dtype)
     if options.has_colors and options.has_depth:
-        depth = view.measures.median.astype(dtype) if asked.reads_median else view.images[0][..., -1]
+        depth = view.measures.median.astype(dtype) if settings.reads_median else view.images[0][..., -1]
         n = view.images[3]
         v_turned = v_surface - n * np.sum(n * v_surface, axis=2, keepdims=True)
         v_R += np.einsum("hwi,hwj->ij", steps.normals_of(depth, camera), v_turned)
         v_depth = central_normals_vjp(depth, camera, v_turned @ R.T)
-        if asked.reads_median:
+        if settings.reads_median:
             v_median = v_median + v_depth
         else:
             v_image[..., -1] += v_depth
@@ -349,7 +349,7 @@ def _add_view_vjp(
     v_R -= np.einsum("hwi,hwj->ij", v_normals, view.images[2])
     v_blended = np.ascontiguousarray(np.concatenate([v_image, v_normals], axis=2))
     of_image = steps.blend_vjp(view.shown, view.blended, v_blended, v_alpha)
-    v_along = v_distortion[..., 0] if asked.has_distortion else np.zeros_like(v_alpha)
+    v_along = v_distortion[..., 0] if settings.has_distortion else np.zeros_like(v_alpha)
     of_rays = steps.measure_vjp(view.shown, view.measures, v_median, v_along)
     v_T, v_c, v_o, v_read = (a + b for a, b in zip(of_image.primitives, of_rays, strict=True))
 
@@ -357,7 +357,7 @@ def _add_view_vjp(
     v_values[:, n_colors - 1] += v_read
     v_depths = v_values[:, n_colors - 1] if options.has_depth else np.zeros(len(v_values))
     v_surfels = SurfelGradient(v_T, v_c, v_o, v_depths, v_values[:, n_colors:])
-    v_p = steps.project_vjp(view.primitives, camera, asked.conventions, view.shown.surfels, v_surfels)
+    v_p = steps.project_vjp(view.primitives, camera, settings.conventions, view.shown.surfels, v_surfels)
     for name, field in zip(Primitives._fields, v_p, strict=False):
         v[f"v_{name}"] += field
     v_R, v_t = v_R + v_p.cam_from_world_R, v_p.cam_from_world_t
@@ -371,7 +371,7 @@ def _add_view_vjp(
         else:
             means, colors = batch.primitives.means, batch.colors_of(c)
             radii, unrotated = view.shown.surfels.radii, remove_rotation(camera)
-            v_sh = asked.backend.sh_colors_vjp(
+            v_sh = settings.backend.sh_colors_vjp(
                 means, colors[:, 0], colors[:, 1:], unrotated, options.sh_degree, radii, v_given
             )
             own += np.concatenate([v_sh.sh_dc[:, None], v_sh.sh_rest], axis=1)

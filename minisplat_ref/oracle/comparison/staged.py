@@ -254,7 +254,7 @@ def _row_of_arrays(
 
 
 def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> str:
-    """Say in which column an error is, if in one only, and whether it is a constant factor."""
+    """Describe an error: its column, if it is in one only, and its factor, if that is constant."""
     if d.n_over == 0 or not np.isfinite(given).all():
         return "" if d.n_over == 0 else "not finite"
     given, expected = np.asarray(given, np.float64), np.asarray(expected, np.float64)
@@ -328,7 +328,7 @@ def slight(rows: Iterable[Row]) -> list[str]:
 
 
 def _describe_unknown(renderer: ComparedRenderer, first: Row, given: Iterable[str]) -> str:
-    """Say which stages that the first one is computed from are not given, so that the error may be in one of them."""
+    """Name the stages before the first one that are not given: the error may be in one of them."""
     if renderer.is_staged:
         return ""
     sources = {source for array in first.arrays or STAGES[first.stage] for source in _sources(array)}

@@ -109,7 +109,7 @@ def cast(bundle: Any, dtype: np.dtype) -> Any:
 
 
 def render_subject(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
-    """Draw a subject in one precision.
+    """Render a subject in one precision.
 
     Raises
     ------

@@ -68,7 +68,7 @@ def from_functions(functions: ModuleType, name: str, profile: Conventions, devic
 
 
 def rules_of(profile: Conventions) -> Callable[[Conventions], Conventions | None]:
-    """How a version of gsplat handles the conventions of a scene."""
+    """Return the rules of a version of gsplat: a function of the conventions of a scene."""
 
     def rules(asked: Conventions) -> Conventions | None:
         free = {field: getattr(asked, field) for field in ("is_antialiased", "near_plane", "far_plane", "eps2d")}
