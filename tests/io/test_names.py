@@ -144,14 +144,14 @@ def test_scores_stay_in_their_folder(tmp_path, nothing_outside, monkeypatch):
     view = scene.train_views[0]
     views = tuple(view._replace(name=name) for name in (str(tmp_path / "deep" / "image"), *NASTY))
 
-    def measure(scene, model, settings, on_view, network):
-        for view in scene.test_views:
+    def measure(model, views, settings, on_view, network):
+        for view in views:
             on_view(view, np.zeros(view.image.shape), ViewMetrics(view.name, 0.0, 0.0))
 
-    monkeypatch.setattr(scoring, "measure", measure)
+    monkeypatch.setattr(scoring, "evaluate", measure)
     (tmp_path / "deep" / "out").mkdir()
     nothing_outside()
-    scoring.score(tmp_path / "deep" / "out", scene._replace(test_views=number_views(views)), None, None)
+    scoring.score(tmp_path / "deep" / "out", number_views(views), None, None)
     assert len(list((tmp_path / "deep" / "out" / "renders").iterdir())) == len(views)
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.app.cli import main
-from minisplat_ref.app.runs import scoring
+from minisplat_ref.app.runs import run, scoring
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -378,7 +378,8 @@ def test_curve_goes_without(scene_folder, weights, tmp_path, monkeypatch):
     """On the way PSNR and SSIM are enough: LPIPS is measured once for each test view."""
     calls = []
     evaluate_views = scoring.evaluate
-    monkeypatch.setattr(scoring, "evaluate", lambda *a, **k: calls.append(k["network"]) or evaluate_views(*a, **k))
+    for user in (run, scoring):
+        monkeypatch.setattr(user, "evaluate", lambda *a, **k: calls.append(k.get("network")) or evaluate_views(*a, **k))
     options = ["--eval-every", "4", "--lpips-weights", str(weights)]
     assert train(scene_folder, tmp_path / "run", *options) == 0
     assert [network is not None for network in calls] == [False, True]

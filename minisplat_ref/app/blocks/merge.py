@@ -6,8 +6,7 @@ from minisplat_ref.app.blocks.plan import COARSE, Asked, Plan, Planned
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.model_file import describe_parts
 from minisplat_ref.app.runs.progress import read_log, write_log
-from minisplat_ref.app.runs.settings import load_frame, load_model, place_model, recipe_of, return_model
-from minisplat_ref.extensions.extension import CORE, owner_of
+from minisplat_ref.app.runs.settings import find_owner, load_frame, load_model, place_model, recipe_of, return_model
 from minisplat_ref.io.frames import return_points
 from minisplat_ref.strategy.ops import concat, contiguous, n_rows, take
 from minisplat_ref.training.adam import zero_moments
@@ -28,7 +27,7 @@ def merge(asked: Asked, plan: Plan, scene: Scene) -> tuple[TrainState, list[str]
     scene : Scene
         The whole.
     """
-    owner = owner_of(asked.settings.recipe, asked.settings.extension) or CORE
+    owner = find_owner(asked.settings)
     recipe = recipe_of(asked.settings)._replace(starts_densely=False)
     parts, steps, notices = [], [], []
     for planned in plan.blocks:

@@ -25,13 +25,10 @@ from minisplat_ref.app.listing_file import select
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.scene_part import Part, Plane, Region, box_from_json
-from minisplat_ref.app.runs.scoring import renderer_of
+from minisplat_ref.app.runs.scoring import choose_render_settings
 from minisplat_ref.app.runs.settings import load, load_model, recipe_of
-from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import Listing
-from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.rendering.backends import get_backend
 from minisplat_ref.types import Floats, Scene
 
 PLAN = "plan.json"
@@ -102,7 +99,7 @@ class Plan(NamedTuple):
         )
 
 
-def begin(asked: Asked, config: dict[str, Any]) -> None:
+def create_folder(asked: Asked, config: dict[str, Any]) -> None:
     """Make the folder: ``plan.json`` without blocks, and the settings.
 
     Parameters
@@ -117,7 +114,7 @@ def begin(asked: Asked, config: dict[str, Any]) -> None:
 
 
 def load_asked(folder: Path) -> Asked:
-    """Read the file of :func:`begin`.
+    """Read the file of :func:`create_folder`.
 
     Raises
     ------
@@ -195,9 +192,7 @@ def load_coarse(asked: Asked, scene: Scene) -> Coarse:
     """Read the coarse model, and its renderer with the scene's background."""
     folder, settings = asked.run_folder_of(COARSE), asked.coarse
     model = load_model(folder, settings)
-    conventions, backend = PROFILES[settings.profile], get_backend(settings.backend)
-    drawn = RenderSettings(scene.background, conventions, backend, renderer_of(settings, model))
-    return Coarse(model, drawn, scene.frame)
+    return Coarse(model, choose_render_settings(settings, model, scene.background), scene.frame)
 
 
 def to_json(asked: Asked, plan: Plan) -> dict[str, Any]:

@@ -55,12 +55,11 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs.first_use import compile_kernels
     from minisplat_ref.app.runs.next_steps import PAGE, live_view
     from minisplat_ref.app.runs.options import Settings
-    from minisplat_ref.app.runs.run import Training, run_training
+    from minisplat_ref.app.runs.preparation import prepare
+    from minisplat_ref.app.runs.run import run_training
     from minisplat_ref.app.runs.scoring import summary
-    from minisplat_ref.app.runs.settings import load_photographs, recipe_of
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import write_scene
-    from minisplat_ref.training.initial_state import initial_state
     from minisplat_ref.training.interruption import terminated_like_interrupted
 
     start = time.perf_counter()
@@ -75,12 +74,11 @@ def run(args: argparse.Namespace) -> int:
         schedule_iterations=SCHEDULE_ITERATIONS,
         iterations=args.iterations,
     )
-    scene = load_photographs(settings)
-    recipe = recipe_of(settings)
-    state = initial_state(scene, recipe, settings.seed)
+    training = prepare(folder, settings)
+    scene, state = training.scene, training.state
     compile_kernels(settings.backend)
     with terminated_like_interrupted(), run_folder.hold_folder(folder):
-        outcome = run_training(Training(folder, scene, settings, recipe, state))
+        outcome = run_training(training)
     if outcome.evaluation is None:
         print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
         return 130

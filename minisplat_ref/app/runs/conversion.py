@@ -78,12 +78,12 @@ def open_source(path: Path, extension: str | None = None) -> Source:
 
 def _of_run(folder: Path) -> Source:
     from minisplat_ref.app.runs.checkpoints import newest_model
-    from minisplat_ref.app.runs.settings import load, load_frame, return_model
+    from minisplat_ref.app.runs.settings import find_owner, load, load_frame, return_model
 
     settings = load(folder)
     saved = newest_model(folder, settings)
     what = "the run's result" if saved.unfinished is None else f"iteration {saved.unfinished}"
-    owner, frame = owner_of(settings.recipe, settings.extension) or CORE, load_frame(folder)
+    owner, frame = find_owner(settings), load_frame(folder)
     label = label_for(owner, saved.model.shared, settings.set)
     return Source(return_model(saved.model, owner, frame), owner, what, frame, label)
 
@@ -236,7 +236,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     InputError
         There is neither a run nor a scene, or the photographs cannot be read.
     """
-    from minisplat_ref.app.runs.scoring import renderer_of
+    from minisplat_ref.app.runs.scoring import choose_renderer
     from minisplat_ref.app.runs.settings import load, load_photographs, place_model
     from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
     from minisplat_ref.io import load_scene
@@ -257,7 +257,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
         )
         profile, backend = settings.profile, settings.backend
         if scene is None:  # its own photographs, for which it may have exposures and poses
-            renderer = renderer_of(settings, source.model)
+            renderer = choose_renderer(settings, source.model)
             photographs = photographs._replace(train_views=number_views(photographs.train_views))
     elif scene is not None:
         photographs = place_scene(load_scene(scene, downscale=downscale or 1, undistort=True), source.frame)

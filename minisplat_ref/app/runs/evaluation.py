@@ -14,10 +14,16 @@ from minisplat_ref.app.runs.first_use import warn_if_not_kept
 from minisplat_ref.app.runs.model_file import choose_owner, label_of, read_population
 from minisplat_ref.app.runs.notices import warn_of_model
 from minisplat_ref.app.runs.options import Settings
-from minisplat_ref.app.runs.scoring import score, to_metrics
-from minisplat_ref.app.runs.settings import load, load_frame, load_lpips, load_photographs, place_model
+from minisplat_ref.app.runs.scoring import choose_render_settings, score, to_metrics
+from minisplat_ref.app.runs.settings import (
+    find_owner,
+    load,
+    load_frame,
+    load_lpips,
+    load_photographs,
+    place_model,
+)
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.extension import CORE, owner_of
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.types import Model, Scene
 
@@ -72,7 +78,7 @@ def evaluate_run(
     )
     saved, frame = newest_model(folder, settings), load_frame(folder)
     if model is not None:
-        owner = owner_of(settings.recipe, settings.extension) or CORE
+        owner = find_owner(settings)
         choose_owner(model, label_of(model), owner, f"run {folder}")
         given = place_model(Model(read_population(model, owner)), owner, frame)
         saved = Saved(saved.model._replace(gaussians=given.gaussians), None)
@@ -99,10 +105,11 @@ def evaluate_run(
         if not fingerprint.is_split_alike(entries, others):
             parts.append(f"test-every-{asked.test_every}")
         notes += _describe_training_views(entries, photographs)
+    render_settings = choose_render_settings(settings, saved.model, photographs.background)
     target = out or (folder / "-".join(["eval", *parts]) if parts else folder)
     if target == folder:
         with run_folder.hold_folder(folder):
-            evaluation = score(folder, photographs, saved.model, settings, network)
+            evaluation = score(folder, photographs.test_views, saved.model, render_settings, network)
             metrics = _metrics_of(folder) | to_metrics(evaluation)
             run_folder.write_json(
                 folder / run_folder.METRICS, metrics | {"n_gaussians": len(saved.model.gaussians.means)}
@@ -110,7 +117,7 @@ def evaluate_run(
         return Measured(evaluation, folder, notes)
     _check_target(target)
     run_folder.create(target)
-    evaluation = score(target, photographs, saved.model, settings, network)
+    evaluation = score(target, photographs.test_views, saved.model, render_settings, network)
     about = _about(folder, asked, saved.unfinished, notes)
     about |= {} if model is None else {"model": str(model.resolve())}
     run_folder.write_json(

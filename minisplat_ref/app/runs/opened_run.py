@@ -8,10 +8,10 @@ from typing import NamedTuple
 from minisplat_ref.app.runs import fingerprint, run_folder
 from minisplat_ref.app.runs.checkpoints import newest_model
 from minisplat_ref.app.runs.options import Settings
-from minisplat_ref.app.runs.settings import load, load_frame, load_photographs, recipe_of
+from minisplat_ref.app.runs.settings import find_owner, load, load_frame, load_photographs, recipe_of
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.extensions.extension import CORE, Extension, owner_of
+from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import get_backend
 from minisplat_ref.strategy.ops import n_rows
@@ -97,8 +97,8 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     run = Run(
         folder,
         settings,
-        match_calibrations(recipe, saved.model),
-        owner_of(settings.recipe, settings.extension) or CORE,
+        as_trained(recipe, saved.model),
+        find_owner(settings),
         photographs._replace(train_views=number_views(photographs.train_views)),
         saved.model,
         run_folder.measured_step(folder) if saved.unfinished is None else saved.unfinished,

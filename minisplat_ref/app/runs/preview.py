@@ -8,7 +8,7 @@ from pathlib import Path
 from minisplat_ref.app.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Progress
-from minisplat_ref.app.runs.scoring import Trained, renderer_of
+from minisplat_ref.app.runs.scoring import Trained, choose_renderer
 from minisplat_ref.io import write_image
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Scene
@@ -41,7 +41,7 @@ def make_preview(folder: Path, scene: Scene, settings: Settings, progress: Progr
             return
         with progress.paused():
             model = report.state.model
-            renderer = renderer_of(settings, model)
+            renderer = choose_renderer(settings, model)
             trained = Trained(model, renderer, scene.background, settings.profile, settings.backend)
             render = to_8_bits(trained.render(view).image[..., :3])
             write_image(folder / FILE, side_by_side([view.image, render, error_image(view.image, render)]))

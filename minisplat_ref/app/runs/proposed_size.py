@@ -12,14 +12,9 @@ import time
 
 import numpy as np
 
-from minisplat_ref.app.runs.options import Settings
-from minisplat_ref.constants import PROFILES
 from minisplat_ref.io.images import downscaled_size
 from minisplat_ref.io.scene import rescale_camera
-from minisplat_ref.rendering import Request
-from minisplat_ref.rendering.backends import get_backend
-from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.training.state import TrainState
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.types import Model, Scene, View
 
 COMFORTABLE = 640  # pixels of the longer side, at which a training takes minutes
@@ -33,19 +28,21 @@ def comfortable_factor(width: int, height: int) -> int:
     return 1 if side < LARGE else math.ceil(side / COMFORTABLE)
 
 
-def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings) -> str | None:
+def propose(scene: Scene, model: Model, settings: RenderSettings, downscale: int) -> str | None:
     """Return a line that proposes a size, or None if the photographs are small enough or the backend is not compiled.
 
     Parameters
     ----------
     scene : Scene
         As it was loaded; at least one training view.
-    state : TrainState
+    model : Model
         Before the first iteration.
-    recipe : Recipe
-    settings : Settings
+    settings : RenderSettings
+        Of the training.
+    downscale : int
+        Factor by which the photographs have been made smaller.
     """
-    if not get_backend(settings.backend).is_compiled:
+    if not settings.backend.is_compiled:
         return None  # NumPy takes minutes for the timed work
     view = max(scene.train_views, key=lambda view: view.camera.width * view.camera.height)
     width, height = view.camera.width, view.camera.height
@@ -53,22 +50,22 @@ def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings)
     if factor == 1:
         return None
     small = view._replace(camera=rescale_camera(view.camera, *downscaled_size(width, height, factor)))
-    large_seconds, small_seconds = (_iteration_seconds(state.model, each, recipe, settings) for each in (view, small))
+    large_seconds, small_seconds = (_iteration_seconds(model, each, settings) for each in (view, small))
     return (
-        f"photographs of {width} x {height} take long: with --downscale {factor * settings.downscale} they are"
+        f"photographs of {width} x {height} take long: with --downscale {factor * downscale} they are"
         f" {small.camera.width} x {small.camera.height}, and an iteration takes {small_seconds:.2g} s instead of"
         f" {large_seconds:.2g} s as training starts"
     )
 
 
-def _iteration_seconds(model: Model, view: View, recipe: Recipe, settings: Settings) -> float:
+def _iteration_seconds(model: Model, view: View, settings: RenderSettings) -> float:
     """Return the median time to render and differentiate a view, over a few runs after a first one."""
-    request = Request(conventions=PROFILES[settings.profile], backend=get_backend(settings.backend))
+    renderer, request = settings.renderer, settings.request()
     v_image = np.ones((view.camera.height, view.camera.width, 3), np.float32)  # [H, W, 3]
     seconds = []
     for _ in range(1 + REPEATS):
         start = time.perf_counter()
-        _, tape = recipe.renderer.render(model, view, request)
-        recipe.renderer.render_vjp(tape, v_image, None)
+        _, tape = renderer.render(model, view, request)
+        renderer.render_vjp(tape, v_image, None)
         seconds.append(time.perf_counter() - start)
     return statistics.median(seconds[1:])

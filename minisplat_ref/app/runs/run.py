@@ -19,21 +19,22 @@ from typing import Any, NamedTuple
 from minisplat_ref.app.runs import checkpoints, curve, events, fingerprint, run_folder
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Clock, Progress
-from minisplat_ref.app.runs.scoring import measure, score, to_metrics
+from minisplat_ref.app.runs.scoring import score, to_metrics
 from minisplat_ref.app.runs.settings import save_model, to_config
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.datasets.synthetic.surface import Surface, surface_distance, true_surface
 from minisplat_ref.errors import InputError
-from minisplat_ref.metrics import Evaluation
+from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.metrics.lpips import Network
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.rendering.backends import get_backend
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import last_step, train
-from minisplat_ref.training.pace import COOLED, FINER, Decision, pace_to_json
-from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
+from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
-from minisplat_ref.types import Scene
+from minisplat_ref.types import Model, Scene
 
 Watch = Callable[[Path, Scene, Settings, Progress], Callable[[StepReport], None]]
 """Makes a callback of the training loop that shows a person how a run in a folder is doing; it pauses the progress."""
@@ -67,12 +68,16 @@ class Training(NamedTuple):
     """Where to start; changed in place."""
     network: Network | None = None
     """Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after."""
-    notes: Sequence[str] = ()
-    """What a person is told as it begins."""
     check_every: int = Guard().every
     """Iterations after which parameters and gradients are looked at for numbers that are not finite."""
     watches: Sequence[Watch] = ()
     """What shows the training to a person while it runs, such as :func:`.preview.make_preview`."""
+
+    def render_settings(self, model: Model) -> RenderSettings:
+        """Return the settings with which a model of this training is rendered."""
+        conventions, backend = PROFILES[self.settings.profile], get_backend(self.settings.backend)
+        renderer = as_trained(self.recipe, model).renderer
+        return RenderSettings(self.scene.background, conventions, backend, renderer)
 
 
 def run_training(training: Training) -> Outcome:
@@ -138,7 +143,7 @@ def _on_step(training: Training, progress: Progress, surface: Surface | None) ->
         callbacks.append(_events(folder / run_folder.EVENTS))
     if settings.eval_every:
         curve.keep_until(folder / run_folder.CURVE, state.step)
-        callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
+        callbacks.append(_curve(training, progress, surface))
     callbacks.extend(watch(folder, scene, settings, progress) for watch in training.watches)
     if settings.minutes is not None:
         callbacks.append(_in_time(settings, recipe, state, progress, len(scene.train_views)))
@@ -211,11 +216,12 @@ def _measure(training: Training, clock: Clock, surface: Surface | None) -> Evalu
 
     folder, scene, settings, _, state = training[:5]
     peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
-    n_gaussians = len(state.gaussians.means)
+    model = state.model
+    n_gaussians = len(model.gaussians.means)
     try:
-        evaluation = score(folder, scene, state.model, settings, training.network)
+        evaluation = score(folder, scene.test_views, model, training.render_settings(model), training.network)
         if settings.eval_every:
-            further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
+            further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(model.gaussians, surface)}
             curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
         metrics = {
             "n_gaussians": n_gaussians,
@@ -238,19 +244,25 @@ def _events(path: Path) -> Callable[[StepReport], None]:
     return lambda report: events.append(path, report.step, report.fired)
 
 
-def _curve(
-    path: Path, scene: Scene, settings: Settings, progress: Progress, surface: Surface | None
-) -> Callable[[StepReport], None]:
+def _curve(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
     """Return a callback of the loop that measures the test views on the way, off the training's clock."""
+    path = training.folder / run_folder.CURVE
 
     def on_step(report: StepReport) -> None:
-        if report.step % settings.eval_every or report.step == report.last_step:  # the end is measured anyway
+        if report.step % training.settings.eval_every or report.step == report.last_step:  # the end is measured anyway
             return
         (seconds, cpu_seconds), model = progress.clock, report.state.model
         with progress.paused():
-            evaluation, further = measure(scene, model, settings), _chamfer(model.gaussians, surface)
-            further = {"cpu_seconds": cpu_seconds, **further}
-            curve.append(path, report.step, seconds, evaluation, len(model.gaussians.means), **further)
+            evaluation = evaluate(model, training.scene.test_views, training.render_settings(model))
+            further = {"cpu_seconds": cpu_seconds, **_chamfer(model.gaussians, surface)}
+            curve.append(
+                path,
+                report.step,
+                seconds,
+                evaluation,
+                len(model.gaussians.means),
+                **further,
+            )
 
     return on_step
 

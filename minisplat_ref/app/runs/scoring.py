@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +21,8 @@ from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.metrics.lpips import Network
 from minisplat_ref.rendering import Renderer, RenderSettings, Request
 from minisplat_ref.rendering.backends import get_backend
-from minisplat_ref.training.recipe_settings import match_calibrations
-from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
+from minisplat_ref.training.schedule import as_trained
+from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 
 class Trained(NamedTuple):
@@ -43,9 +43,15 @@ class Trained(NamedTuple):
         return self.renderer.render(self.model, view, request)[0]
 
 
-def renderer_of(settings: Settings, model: Model) -> Renderer:
-    """Return the model of a run with its renderer: with the sky that it has been given, too."""
-    return match_calibrations(recipe_of(settings), model).renderer
+def choose_renderer(settings: Settings, model: Model) -> Renderer:
+    """Return the renderer with which a run renders a model: with the sky that it has been given, too."""
+    return as_trained(recipe_of(settings), model).renderer
+
+
+def choose_render_settings(settings: Settings, model: Model, background: Floats) -> RenderSettings:
+    """Return the settings with which a run renders a model before a background [3]."""
+    conventions, backend = PROFILES[settings.profile], get_backend(settings.backend)
+    return RenderSettings(background, conventions, backend, choose_renderer(settings, model))
 
 
 def load_trained(folder: Path) -> Trained:
@@ -61,34 +67,14 @@ def load_trained(folder: Path) -> Trained:
     if saved.unfinished is not None:
         message = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
-    renderer, background = renderer_of(settings, saved.model), load_background(folder)
+    renderer, background = choose_renderer(settings, saved.model), load_background(folder)
     return Trained(saved.model, renderer, background, settings.profile, settings.backend)
 
 
-def measure(
-    scene: Scene,
-    model: Model,
-    settings: Settings,
-    on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
-    network: Network | None = None,
+def score(
+    folder: Path, views: Sequence[View], model: Model, settings: RenderSettings, network: Network | None = None
 ) -> Evaluation:
-    """Evaluate the test views with renderer, profile and backend of a run: :func:`minisplat_ref.metrics.evaluate`."""
-    return evaluate(
-        model,
-        scene.test_views,
-        RenderSettings(
-            scene.background,
-            renderer=renderer_of(settings, model),
-            backend=get_backend(settings.backend),
-            conventions=PROFILES[settings.profile],
-        ),
-        on_view=on_view,
-        network=network,
-    )
-
-
-def score(folder: Path, scene: Scene, model: Model, settings: Settings, network: Network | None = None) -> Evaluation:
-    """Evaluate the test views and write ``renders/NAME.png``: truth, render and error side by side.
+    """Evaluate test views and write ``renders/NAME.png``: truth, render and error side by side.
 
     The earlier content of ``renders`` is removed when all views have been measured, and not earlier.
 
@@ -96,12 +82,10 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     ----------
     folder : Path
         Of the run, or of another evaluation.
-    scene : Scene
-        Its test views are measured.
+    views : sequence of View
     model : Model
-        What was trained.
-    settings : Settings
-        Of the run: renderer, profile and backend.
+        The trained model.
+    settings : RenderSettings
     network : Network, optional
         For LPIPS, see :func:`minisplat_ref.app.runs.settings.load_lpips`.
 
@@ -109,7 +93,7 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     -------
     Evaluation
     """
-    names = [view.name for view in scene.test_views]
+    names = [view.name for view in views]
     stems = dict(zip(names, file_names(names), strict=True))
     with (
         replacing_folder(folder / RENDERS) as renders,
@@ -122,7 +106,7 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
             write_image(renders / f"{stems[view.name]}.png", side_by_side(panels))
             bar.update()
 
-        return measure(scene, model, settings, on_view=save, network=network)
+        return evaluate(model, views, settings, on_view=save, network=network)
 
 
 def to_metrics(evaluation: Evaluation) -> dict[str, Any]:

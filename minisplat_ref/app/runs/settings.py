@@ -73,6 +73,11 @@ def recipe_of(settings: Settings) -> Recipe:
     return recipe
 
 
+def find_owner(settings: Settings) -> Extension:
+    """Return the extension whose population a run trains; :data:`CORE` for the Gaussians of 3DGS."""
+    return owner_of(settings.recipe, settings.extension) or CORE
+
+
 def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> None:
     """Write the population, and the shared parameters if there are any, into the folder of a run.
 
@@ -86,7 +91,7 @@ def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> 
     frame : Frame
         That of the run's scene.
     """
-    owner = owner_of(settings.recipe, settings.extension) or CORE
+    owner = find_owner(settings)
     model = return_model(model, owner, frame)
     owner.save(folder / POINT_CLOUD, model.gaussians, label_for(owner, model.shared, settings.set))
     if model.shared:
@@ -122,7 +127,7 @@ def load_model(folder: Path, settings: Settings) -> Model:
     InputError
         A file is missing or damaged, or the extension is.
     """
-    owner = owner_of(settings.recipe, settings.extension) or CORE
+    owner = find_owner(settings)
     gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
     shared = read_npz(folder / SHARED, "train again") if (folder / SHARED).exists() else NOTHING
     return place_model(Model(gaussians, shared), owner, load_frame(folder))
@@ -232,7 +237,7 @@ def load_photographs(settings: Settings, frame: Frame | None = None, listing: Li
     InputError
         See :func:`minisplat_ref.io.load_scene`.
     """
-    owner = owner_of(settings.recipe, settings.extension) or CORE
+    owner = find_owner(settings)
     part = None if settings.block is None else read_part(Path(settings.block), Path(settings.scene))
     if listing is None:
         listing = list_photographs(settings) if part is None else part.listing
@@ -263,7 +268,7 @@ def check_frame(settings: Settings, scene: Scene) -> None:
     InputError
         Says how far it is.
     """
-    owner = owner_of(settings.recipe, settings.extension) or CORE
+    owner = find_owner(settings)
     if any(scene.frame.origin) and owner.save is not save_ply:
         distance = float(np.linalg.norm(scene.frame.origin))
         raise InputError(

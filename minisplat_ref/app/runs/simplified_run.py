@@ -14,12 +14,12 @@ from minisplat_ref.app.reports.plots import save_png
 from minisplat_ref.app.runs import fingerprint, run_folder
 from minisplat_ref.app.runs.opened_run import Run, open_run
 from minisplat_ref.app.runs.rate_distortion import Point, paired_drop
-from minisplat_ref.app.runs.scoring import measure, score, to_metrics
+from minisplat_ref.app.runs.scoring import score, to_metrics
 from minisplat_ref.app.runs.settings import save_model
 from minisplat_ref.app.runs.simplification import Decision, Target, decide, finish, is_merged, measuring
 from minisplat_ref.app.runs.simplification_report import Shown, draw, report_html
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.metrics import Evaluation, ViewMetrics
+from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.types import Floats, Model, View
 
 RESULT, FIGURE = "result.json", "figure.png"  # the decision, in addition to the files of every run
@@ -57,8 +57,9 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
         is_unchanged, n = decision.is_unchanged, decision.chosen.n_gaussians
         model = run.model if is_unchanged else finish(run, n, asked.fine_tune)
         save_model(folder, run.settings, model, run.scene.frame)
-        after = score(folder, run.scene, model, run.settings)
-        before = after if is_unchanged else measure(run.scene, run.model, run.settings)
+        views, render_settings = run.scene.test_views, run.render_settings
+        after = score(folder, views, model, render_settings)
+        before = after if is_unchanged else evaluate(run.model, views, render_settings)
         result = {**to_result(run, asked, decision), "test": of_test_views(before, after)}
         _write_run(folder, run, result, after)
         run_folder.write_json(folder / RESULT, result)
@@ -76,7 +77,7 @@ def _images(run: Run, model: Model) -> dict[str, Image8]:
     def keep(view: View, image: Floats, _: ViewMetrics) -> None:
         images[view.name] = to_8_bits(image)
 
-    measure(run.scene._replace(test_views=run.scene.test_views[:N_SHOWN]), model, run.settings, on_view=keep)
+    evaluate(model, run.scene.test_views[:N_SHOWN], run.render_settings, on_view=keep)
     return images
 
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from minisplat_ref.app.runs.checkpoints import newest_model
 from minisplat_ref.app.runs.run_folder import POINT_CLOUD
-from minisplat_ref.app.runs.settings import load, load_frame, place_model, return_model
+from minisplat_ref.app.runs.settings import find_owner, load, load_frame, place_model, return_model
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.extension import CORE, owner_of
 from minisplat_ref.io.frames import place_points
 from minisplat_ref.io.ply import MEANS, NORMALS, load_points
 from minisplat_ref.io.ply_file import property_names
@@ -91,7 +90,7 @@ def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
         or no training view sees the model.
     """
     theirs = load(folder)
-    owner = owner_of(theirs.recipe, theirs.extension) or CORE
+    owner = find_owner(theirs)
     saved = newest_model(folder, theirs)
     model = place_model(return_model(saved.model, owner, load_frame(folder)), owner, scene.frame)
     if not are_seen(model.gaussians.means, [view.camera for view in scene.train_views]).any():

@@ -8,7 +8,7 @@ from typing import Any
 
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Progress
-from minisplat_ref.app.runs.scoring import Trained, renderer_of
+from minisplat_ref.app.runs.scoring import Trained, choose_renderer
 from minisplat_ref.app.viewer.browser import Content, Viewer
 from minisplat_ref.app.viewer.photographs import thumbnails
 from minisplat_ref.io.viewpoints import scene_viewpoints
@@ -34,7 +34,7 @@ def make_live_view(server: Any) -> Callable[[Path, Scene, Settings, Progress], C
             with progress.paused():
                 if viewer is None or time.perf_counter() - last >= SECONDS or report.step == report.last_step:
                     model = report.state.model
-                    renderer = renderer_of(settings, model)
+                    renderer = choose_renderer(settings, model)
                     trained = Trained(model, renderer, scene.background, settings.profile, settings.backend)
                     if viewer is None:
                         content = Content(trained, scene_viewpoints(scene), lambda: thumbnails(scene), None)

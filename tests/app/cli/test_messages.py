@@ -13,7 +13,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from minisplat_ref import Gaussians, io, save_ply
-from minisplat_ref.app.cli import main, train
+from minisplat_ref.app.cli import main, train_whole
 from minisplat_ref.app.cli import sfm as sfm_command
 from minisplat_ref.app.runs import first_use
 from minisplat_ref.app.runs.notices import warn_of_model, warn_of_scene
@@ -176,7 +176,7 @@ def test_photographs_of_a_few_pixels(tmp_path):
 
 def test_training_says_so(tmp_path, capsys, monkeypatch):
     scene = write_transforms(tmp_path / "scene", fl_x=40.0)
-    monkeypatch.setattr(train, "_train", lambda *_: 0)
+    monkeypatch.setattr(train_whole, "complete", lambda *_: 0)
     options = ["--recipe", "3dgs-accel", "--out", str(tmp_path / "out"), "--backend", "reference"]
     assert main(["train", str(scene), *options]) == 0
     lines = capsys.readouterr().err.splitlines()

@@ -96,14 +96,14 @@ def test_interrupted_and_resumed(measured, scene_folder, tmp_path, monkeypatch):
 
 def test_the_clock_stands_while_views_are_measured(scene_folder, tmp_path, monkeypatch):
     """Each measurement takes 1000 seconds by a clock that is put forward."""
-    real_clock, real_measure, put_forward = time.perf_counter, training.measure, []
+    real_clock, real_evaluate, put_forward = time.perf_counter, training.evaluate, []
 
-    def slow_measure(*args):
+    def slow_evaluate(*args):
         put_forward.append(1000.0)
-        return real_measure(*args)
+        return real_evaluate(*args)
 
     monkeypatch.setattr(progress_module.time, "perf_counter", lambda: real_clock() + sum(put_forward))
-    monkeypatch.setattr(training, "measure", slow_measure)
+    monkeypatch.setattr(training, "evaluate", slow_evaluate)
     assert train(scene_folder, tmp_path / "run", "--eval-every", "5") == 0
     assert len(put_forward) == 3
     for name in ("curve.jsonl", "log.jsonl"):

@@ -171,7 +171,7 @@ def test_the_clock_of_a_training_stands_still_while_a_frame_is_drawn(monkeypatch
             return lambda *_: done.append(is_paused[0])
 
     monkeypatch.setattr(live, "Viewer", Watched)
-    monkeypatch.setattr(live, "renderer_of", lambda settings, model: SPLATTING)
+    monkeypatch.setattr(live, "choose_renderer", lambda settings, model: SPLATTING)
     scene = make_scene("room", n_views=3, width=16, height=12, supersampling=1, n_points=20).scene
     settings, progress = SimpleNamespace(profile="GSPLAT_MAIN", backend="cpu"), SimpleNamespace(paused=paused)
     on_step = live.make_live_view(None)(None, scene, settings, progress)
