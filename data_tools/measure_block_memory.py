@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from itertools import repeat
 from pathlib import Path
 
-from minisplat_ref.app.blocks.plan import COARSE, load_asked, load_plan
+from minisplat_ref.app.blocks.plan import COARSE, load_block_training, load_plan
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
 
@@ -64,10 +64,10 @@ def _evens(lines: list[str]) -> Iterable[int]:
 
 def peaks(folder: Path) -> Iterator[tuple[str, int, float]]:
     """Yield of each training of a folder its name, its Gaussians, and the memory of its process, MB."""
-    plan, asked = load_plan(folder), load_asked(folder)
+    plan, asked = load_plan(folder), load_block_training(folder)
     assert plan is not None
     for name in (COARSE, *(planned.block.name for planned in plan.blocks)):
-        metrics = run_folder.read_json_object(asked.run_folder_of(name) / run_folder.METRICS)
+        metrics = run_folder.read_json_object(asked.run_folder_for(name) / run_folder.METRICS)
         yield name, metrics["n_gaussians"], metrics["peak_rss_mb"]
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.blocks.plan import COARSE, Plan, load_asked, load_plan
+from minisplat_ref.app.blocks.plan import COARSE, Plan, load_block_training, load_plan
 from minisplat_ref.app.blocks.train import is_unfinished
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.scoring import load_trained
@@ -67,7 +67,7 @@ def train(folder: Path, words: list[str]) -> Trained:
     if plan is None:
         return Trained(folder, (folder,))
     names = [COARSE, *(planned.block.name for planned in plan.blocks)]
-    return Trained(folder, tuple(load_asked(folder).run_folder_of(name) for name in names))
+    return Trained(folder, tuple(load_block_training(folder).run_folder_for(name) for name in names))
 
 
 def seam_errors(trained: Trained, whole: Trained, plan: Plan) -> tuple[float, float]:

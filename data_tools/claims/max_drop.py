@@ -33,7 +33,7 @@ from data_tools.claims.kit.figures import subplots
 from minisplat_ref.app.runs.opened_run import Run, check_views
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.rate_distortion import paired_drop
-from minisplat_ref.app.runs.simplification import Target, decide, finish, measuring, metrics_of
+from minisplat_ref.app.runs.simplification import Target, decide, evaluate_views, finish, make_measure
 from minisplat_ref.extensions.extension import CORE
 from minisplat_ref.interface.arguments import decibels, list_of
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED
@@ -85,14 +85,14 @@ def train_run(scene: Scene, args: argparse.Namespace, seed: int) -> Run:
 
 def measure_limits(run: Run, limits: Sequence[float], fine_tune: int) -> list[dict[str, Any]]:
     """Return for each limit what was chosen, and what it loses on held-out training views and on test views."""
-    point_of = measuring(run, fine_tune)
-    before = [view.psnr for view in metrics_of(run, run.model, run.scene.test_views)]
+    point_of = make_measure(run, fine_tune)
+    before = [view.psnr for view in evaluate_views(run, run.model, run.scene.test_views)]
     records = []
     for limit in limits:
         decision = decide(run, Target(max_drop=limit), point_of)
         n = decision.chosen.n_gaussians
         model = run.model if decision.is_unchanged else finish(run, n, fine_tune)
-        after = [view.psnr for view in metrics_of(run, model, run.scene.test_views)]
+        after = [view.psnr for view in evaluate_views(run, model, run.scene.test_views)]
         lost, error = paired_drop(before, after)
         records.append(
             {

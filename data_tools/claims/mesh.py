@@ -19,7 +19,7 @@ from data_tools.claims.kit.figures import plot_curves, subplots
 from data_tools.claims.kit.mesh_distances import OrientedPoints, compare_surfaces, sample_surface
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.app.runs.depth_maps import DepthKind
-from minisplat_ref.app.runs.meshing import Asked, Opened, mesh_run
+from minisplat_ref.app.runs.meshing import MeshOptions, Opened, mesh_run
 from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
@@ -104,7 +104,7 @@ def measure_meshes(opened: Opened, truth: OrientedPoints) -> list[dict[str, Any]
     settings += [(kind, DEPTH_VOXEL) for kind in DepthKind if kind is not DepthKind.MEDIAN and _has(opened, kind)]
     records = []
     for kind, voxel in kit.with_progress(settings, "meshes"):
-        mesh = mesh_run(opened, Asked(Path("run"), kind, voxel)).mesh
+        mesh = mesh_run(opened, MeshOptions(Path("run"), kind, voxel)).mesh
         found = sample_surface(mesh.vertices, mesh.faces, N_POINTS, np.random.default_rng(0))
         distances = compare_surfaces(found, truth, TAU)
         records.append({"depth": kind.value, "voxel": voxel, **distances._asdict(), "chamfer": distances.chamfer})
@@ -114,7 +114,7 @@ def measure_meshes(opened: Opened, truth: OrientedPoints) -> list[dict[str, Any]
 def _has(opened: Opened, kind: DepthKind) -> bool:
     """Return whether the renderer of a run has a kind of depth; surfels have no dominant Gaussian."""
     try:
-        opened.map_of(opened.views[0], kind)
+        opened.render_map(opened.views[0], kind)
     except InputError:
         return False
     return True

@@ -110,7 +110,7 @@ def _compare_runs(what: str, left: str, how: str, done: Done, whole: Path, out: 
 def _what_is_left(out: Path) -> str:
     if not out.exists() or not any(out.iterdir()):
         return "nothing"
-    step, n_parts = checkpoints.step_of(out), sum(map(is_part, out.iterdir()))
+    step, n_parts = checkpoints.read_step(out), sum(map(is_part, out.iterdir()))
     saved = "no checkpoint" if step is None else f"iteration {step}"
     return f"{saved}, {n_parts} unfinished" if n_parts else saved
 

@@ -22,7 +22,7 @@ from minisplat_ref import memory
 from minisplat_ref.app.runs import memory_needs
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run import Training, run_training
-from minisplat_ref.app.runs.settings import load_photographs, recipe_of
+from minisplat_ref.app.runs.settings import configure_recipe, load_photographs
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -149,7 +149,7 @@ def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
         schedule_iterations=N_ITERATIONS,
         iterations=N_ITERATIONS,
     )
-    recipe = recipe_of(settings)._replace(events=())  # the number of Gaussians stays
+    recipe = configure_recipe(settings)._replace(events=())  # the number of Gaussians stays
     scene = load_photographs(settings)
     before = bytes_in_use()
     state = initial_state(scene, recipe, settings.seed) if n is None else _state(scene, n)

@@ -63,12 +63,12 @@ def take_inventory(path: Path, scene: Scene, model: str | None = None) -> Invent
         The requested model.
     """
     folder = find_model(path, model)
-    return _of_transforms(path) if folder is None else _of_colmap(path, folder, scene)
+    return _take_from_transforms(path) if folder is None else _take_from_colmap(path, folder, scene)
 
 
-def _of_colmap(path: Path, model: Path, scene: Scene) -> Inventory:
+def _take_from_colmap(path: Path, model: Path, scene: Scene) -> Inventory:
     names = image_names(model)
-    photographs = _images_in(path / "images")
+    photographs = _list_images(path / "images")
     names = {spelled_on_disk(path / "images", name) for name in names}
     n_placed = len(photographs & names)
     used = f"{n_placed} of {len(photographs)} photographs have cameras"
@@ -85,7 +85,7 @@ def _without_camera(names: Sequence[str]) -> list[str]:
     return [f"without a camera: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"] if names else []
 
 
-def _images_in(folder: Path) -> set[str]:
+def _list_images(folder: Path) -> set[str]:
     """Return the image files in a folder and below, by their names relative to it; hidden ones do not count."""
     if not folder.is_dir():
         return set()
@@ -98,7 +98,7 @@ def _unused_masks(path: Path, names: Iterable[str]) -> list[str]:
     said = []
     fitting = {form.casefold() for name in names for form in (f"{name}.png", Path(name).with_suffix(".png").as_posix())}
     for folder in _folders(path):
-        files = _images_in(folder) if MASK_FOLDERS.fullmatch(folder.name) else set()
+        files = _list_images(folder) if MASK_FOLDERS.fullmatch(folder.name) else set()
         n_fit = sum(file.casefold() in fitting for file in files) if folder.name == "masks" else 0
         if n_fit < len(files):
             example = sorted(names)[0]
@@ -203,7 +203,7 @@ def _deviation(places: Floats, others: Floats) -> float:
     return float(np.abs(distances(places) - distances(others)).max())
 
 
-def _of_transforms(path: Path) -> Inventory:
+def _take_from_transforms(path: Path) -> Inventory:
     files = find_transforms(path)
     folder = files[0].parent
     sets = [read_transforms(file) for file in files]
@@ -221,8 +221,8 @@ def _of_transforms(path: Path) -> Inventory:
     unused = [
         *_without_camera(missing),
         *_unnamed_masks(folder, masks),
-        *_splits_of(files, sets, stems),
-        *_clouds_of(files[0], sets[0]),
+        *_list_splits(files, sets, stems),
+        *_list_clouds(files[0], sets[0]),
         *(f"{key} of {n} frames is not used" for key in FRAME_KEYS if (n := sum(key in frame for frame in frames))),
     ]
     return Inventory(used, tuple(unused))
@@ -232,15 +232,15 @@ def _unnamed_masks(folder: Path, masks: set[str]) -> list[str]:
     """Report for each folder of masks how many of its files the frames name, unless all are named."""
     said = []
     for place in _folders(folder):
-        files = _images_in(place) if MASK_FOLDERS.fullmatch(place.name) else set()
+        files = _list_images(place) if MASK_FOLDERS.fullmatch(place.name) else set()
         n_fit = sum((place / file).as_posix() in masks for file in files)
         if n_fit < len(files):
             said.append(f"{place.name}/ has {len(files)} files, {n_fit} fit: a frame names its mask as mask_path")
     return said
 
 
-def _splits_of(files: Sequence[Path], sets: Sequence[Mapping[str, Any]], stems: set[str]) -> list[str]:
-    """Say which splits of the photographs are not used."""
+def _list_splits(files: Sequence[Path], sets: Sequence[Mapping[str, Any]], stems: set[str]) -> list[str]:
+    """Return sentences about the splits of the photographs that are not used."""
     folder = files[0].parent
     said = [
         f"{key} of {files[0].name} ({len(sets[0][key])}) is not used, test views are every K-th (--test-every)"
@@ -269,7 +269,7 @@ def _stem(folder: Path, frame: Mapping[str, Any]) -> str:
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
 
 
-def _clouds_of(file: Path, transforms: Mapping[str, Any]) -> list[str]:
+def _list_clouds(file: Path, transforms: Mapping[str, Any]) -> list[str]:
     """Report point clouds that lack colours or are not referenced."""
     points = find_points(file, transforms)
     if points is None:

@@ -81,7 +81,7 @@ def to_arrays(listing: Listing) -> dict[str, NDArray[Any]]:
     }
 
 
-def from_files(source: Path, content: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Listing:
+def read_listing(source: Path, content: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Listing:
     """Return the listing of which :func:`to_json` and :func:`to_arrays` made ``content`` and ``arrays``.
 
     Parameters

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from minisplat_ref.app.listing_file import ARRAYS, from_files, select, to_arrays, to_json
+from minisplat_ref.app.listing_file import ARRAYS, read_listing, select, to_arrays, to_json
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
@@ -27,7 +27,7 @@ def scene_folder(tmp_path_factory):
 
 def through_files(listing, source):
     content = json.loads(json.dumps(to_json(listing)))
-    return from_files(source, content, to_arrays(listing))
+    return read_listing(source, content, to_arrays(listing))
 
 
 def photo_of(folder, file, point_ids=None, **fields):
@@ -51,7 +51,7 @@ def test_a_part_is_read_without_the_model(scene_folder, tmp_path):
     (moved / "images").mkdir(parents=True)
     for name in names:
         shutil.copy(scene_folder / "images" / f"{name}.png", moved / "images")
-    again = from_files(moved, json.loads(json.dumps(to_json(part))), to_arrays(part))
+    again = read_listing(moved, json.loads(json.dumps(to_json(part))), to_arrays(part))
     scene = build_scene(again, build_reading(1, None, False, again.alpha_is_mask))
     assert [view.name for view in scene.train_views] == sorted(names) and not scene.test_views
     for view, expected in zip(scene.train_views, (whole.train_views[1], whole.train_views[3]), strict=True):
@@ -101,7 +101,7 @@ def test_files_lens_and_time_come_back(tmp_path):
     assert not through_files(listing, file).alpha_is_mask and set(to_arrays(listing)) == set(ARRAYS)
     moved = tmp_path / "moved"
     moved.mkdir()
-    assert from_files(moved, content, to_arrays(listing)).train_photos[0].path == moved / "images" / "b.png"
+    assert read_listing(moved, content, to_arrays(listing)).train_photos[0].path == moved / "images" / "b.png"
 
 
 def test_a_scene_without_photographs_has_no_views(tmp_path):

@@ -103,7 +103,7 @@ def reader_of(first: str, second: str) -> Reader:
             run = partial(runpy.run_module, first, run_name="__main__")
             reader = _ANY_WORDS if first in UNREADABLE else _reader_in(run, n_names=1)
     else:
-        reader = Reader(cli._parser_of([first]))
+        reader = Reader(cli._find_parser([first]))
     _accept_placeholders(reader.parser)
     return reader
 
@@ -175,7 +175,7 @@ def command_of(words: list[str]) -> Command:
     return Command(top, words, parser, rest)
 
 
-def error_of(text: str, is_line: bool = False) -> str:
+def compute_error(text: str, is_line: bool = False) -> str:
     """Return what is wrong with a command, mostly in argparse's words; empty where it can be typed."""
     text = re.sub(r"\[[^]]*\]", " ", text)  # what may be left out
     text = re.sub(r"(?<=[A-Z])\.\.\.", "", text)  # SCENE...: one scene or several
@@ -326,7 +326,7 @@ SOURCES = {in_pages: 250, in_changes: 0, in_notebooks: 15, in_strings: 350, in_h
 def test_quoted_commands_can_be_typed(source):
     quotes = list(source())
     assert len(quotes) >= SOURCES[source]
-    wrong = [f"{place}: {text}: {error}" for place, text, is_line in quotes if (error := error_of(text, is_line))]
+    wrong = [f"{place}: {text}: {error}" for place, text, is_line in quotes if (error := compute_error(text, is_line))]
     assert not wrong, "\n" + "\n".join(wrong)
 
 
@@ -340,7 +340,7 @@ def test_extensions_prints_commands_that_exist(name, capsys):
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("commands ")]
     quoted = [each for row in rows for each in re.findall(r"minisplat-ref ([^,]+)", row)]
     assert len(quoted) >= len(load_extension(name).commands)
-    assert [(each, error) for each in quoted if (error := error_of(each))] == []
+    assert [(each, error) for each in quoted if (error := compute_error(each))] == []
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_extensions_prints_commands_that_exist(name, capsys):
     ],
 )
 def test_right_quotes(text, is_line):
-    assert error_of(text, is_line) == ""
+    assert compute_error(text, is_line) == ""
 
 
 @pytest.mark.parametrize(
@@ -396,7 +396,7 @@ def test_right_quotes(text, is_line):
     ],
 )
 def test_wrong_quotes(text, is_line, error):
-    assert error in error_of(text, is_line)
+    assert error in compute_error(text, is_line)
 
 
 def test_where_a_text_has_quotes():

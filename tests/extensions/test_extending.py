@@ -14,7 +14,7 @@ import minisplat_ref
 from data_tools.claims import find_claim
 from data_tools.claims.__main__ import parser_of
 from minisplat_ref import extensions
-from minisplat_ref.app.cli import _parser_of, main
+from minisplat_ref.app.cli import _find_parser, main
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.training.losses import Rendered
@@ -77,7 +77,7 @@ def test_commands_parse(command, tmp_path, monkeypatch):
         parser_of(arguments[2], find_claim(arguments[2])).parse_args(arguments[3:])
         return
     assert program == "minisplat-ref"
-    assert callable(_parser_of(arguments).parse_args(arguments).run)
+    assert callable(_find_parser(arguments).parse_args(arguments).run)
     for option, value in itertools.pairwise(arguments):
         if option == "--extension" and value != "faint":
             assert load_extension(value).name == value

@@ -153,7 +153,7 @@ def test_views_are_those_that_memory_would_hold(name, tmp_path, monkeypatch):
                 assert (view.view_id, view.time) == (other.view_id, other.time)
             assert np.array_equal(view.camera.cam_from_world_R, other.camera.cam_from_world_R)
             assert type(half_size(view)) is StoredView and type(view.load()) is View
-    assert fingerprint.of_scene(stored) == fingerprint.of_scene(held)
+    assert fingerprint.take_fingerprint(stored) == fingerprint.take_fingerprint(held)
 
 
 def test_another_image_replaces_the_stored_one(scene, few):
@@ -263,7 +263,7 @@ def test_evaluations_hold_no_more_than_they_show(scene, alive, monkeypatch):
     loaded = loaded._replace(test_views=loaded.train_views)
     model = initial_state(loaded, get_recipe("3dgs-accel"), 0).model
     assert alive["threads"] == []
-    assert fingerprint.of_scene(loaded) == fingerprint.of_scene(loaded)
+    assert fingerprint.take_fingerprint(loaded) == fingerprint.take_fingerprint(loaded)
     assert len(alive["threads"]) == N_PHOTOS  # not twice
     evaluate(model, loaded.test_views, RenderSettings(loaded.background))
     assert len(alive["threads"]) == 2 * N_PHOTOS

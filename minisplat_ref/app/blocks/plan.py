@@ -26,7 +26,7 @@ from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.scene_part import Part, Plane, Region, box_from_json
 from minisplat_ref.app.runs.scoring import choose_render_settings
-from minisplat_ref.app.runs.settings import load, load_model, recipe_of
+from minisplat_ref.app.runs.settings import configure_recipe, load, load_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import Listing
 from minisplat_ref.types import Floats, Scene
@@ -41,7 +41,7 @@ TRAINED_COPIES = 4  # parameters, gradients, two moments
 FRESH: dict[str, Any] = {"extension": None, "set": {}, "simplify": None, "scene_type": None}
 
 
-class Asked(NamedTuple):
+class BlockTraining(NamedTuple):
     """The requested settings."""
 
     folder: Path
@@ -55,7 +55,7 @@ class Asked(NamedTuple):
         """The folder of the trainings."""
         return self.folder / run_folder.BLOCKS
 
-    def run_folder_of(self, name: str) -> Path:
+    def run_folder_for(self, name: str) -> Path:
         """Return the run folder of a block, or of the coarse model."""
         return self.blocks_folder / name
 
@@ -63,7 +63,7 @@ class Asked(NamedTuple):
     def coarse(self) -> Settings:
         """Settings of the coarse training."""
         whole = self.settings.iterations
-        n = COARSE_ITERATIONS if recipe_of(self.settings).cooling is not None else whole // COARSE_PART
+        n = COARSE_ITERATIONS if configure_recipe(self.settings).cooling is not None else whole // COARSE_PART
         n = max(1, min(n, whole))
         return replace(self.settings, recipe=COARSE_RECIPE, iterations=n, schedule_iterations=n, **FRESH)
 
@@ -88,32 +88,32 @@ class Plan(NamedTuple):
     trained: float
     """As :attr:`~minisplat_ref.app.blocks.coverage.Coverage.trained`."""
 
-    def settings_of(self, asked: Asked, planned: Planned) -> Settings:
+    def make_settings(self, training: BlockTraining, planned: Planned) -> Settings:
         """Return the settings of the training of a block."""
         return replace(
-            asked.settings,
+            training.settings,
             iterations=planned.iterations,
             schedule_iterations=planned.iterations,
-            init=str(asked.run_folder_of(COARSE).resolve()),
-            block=str((asked.blocks_folder / f"{planned.block.name}.json").resolve()),
+            init=str(training.run_folder_for(COARSE).resolve()),
+            block=str((training.blocks_folder / f"{planned.block.name}.json").resolve()),
         )
 
 
-def create_folder(asked: Asked, config: dict[str, Any]) -> None:
+def create_folder(training: BlockTraining, config: dict[str, Any]) -> None:
     """Make the folder: ``plan.json`` without blocks, and the settings.
 
     Parameters
     ----------
-    asked : Asked
+    training : BlockTraining
     config : dict
         Of :func:`minisplat_ref.app.runs.settings.to_config`.
     """
-    run_folder.create(asked.blocks_folder)
-    run_folder.write_json(asked.blocks_folder / run_folder.CONFIG, config)
-    run_folder.write_json(asked.folder / PLAN, {"grid": list(asked.shape)})
+    run_folder.create(training.blocks_folder)
+    run_folder.write_json(training.blocks_folder / run_folder.CONFIG, config)
+    run_folder.write_json(training.folder / PLAN, {"grid": list(training.shape)})
 
 
-def load_asked(folder: Path) -> Asked:
+def load_block_training(folder: Path) -> BlockTraining:
     """Read the file of :func:`create_folder`.
 
     Raises
@@ -124,15 +124,15 @@ def load_asked(folder: Path) -> Asked:
     shape = run_folder.read_json_object(folder / PLAN).get("grid")
     if not (isinstance(shape, list) and len(shape) == 2 and all(type(n) is int and n > 0 for n in shape)):
         raise InputError(f"{folder / PLAN} has no grid of two whole numbers: train again, into another folder")
-    return Asked(folder, load(folder / run_folder.BLOCKS), (shape[0], shape[1]))
+    return BlockTraining(folder, load(folder / run_folder.BLOCKS), (shape[0], shape[1]))
 
 
-def make_plan(asked: Asked, listing: Listing, scene: Scene, coarse: Coarse, centers: Floats) -> Plan:
+def make_plan(training: BlockTraining, listing: Listing, scene: Scene, coarse: Coarse, centers: Floats) -> Plan:
     """Plan by the coarse model, and write the parts of all blocks.
 
     Parameters
     ----------
-    asked : Asked
+    training : BlockTraining
     listing : Listing
         Of the whole.
     scene : Scene
@@ -148,13 +148,13 @@ def make_plan(asked: Asked, listing: Listing, scene: Scene, coarse: Coarse, cent
         The cameras cannot be divided so, or a block has too few photographs.
     """
     plane = ground_plane(centers)
-    blocks = divide(plane.coordinates(centers), asked.shape)
+    blocks = divide(plane.coordinates(centers), training.shape)
     masks, trained = cover(coarse, scene, plane, blocks)
     for block, own in zip(blocks, masks, strict=True):
         part = Part(Region(plane, block.region), select(listing, own.keys()), own)
-        part.write(asked.blocks_folder / f"{block.name}.json")
-    n_views, cooling = len(scene.train_views), recipe_of(asked.settings).cooling
-    whole = asked.settings.iterations
+        part.write(training.blocks_folder / f"{block.name}.json")
+    n_views, cooling = len(scene.train_views), configure_recipe(training.settings).cooling
+    whole = training.settings.iterations
     gaussians = coarse.model.gaussians
     places = plane.coordinates(coarse.means)  # [N, 2]
     planned = []
@@ -167,12 +167,12 @@ def make_plan(asked: Asked, listing: Listing, scene: Scene, coarse: Coarse, cent
     return Plan(plane, tuple(planned), trained)
 
 
-def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> str | None:
+def too_large(training: BlockTraining, plan: Plan, n_workers: int, free_bytes: float) -> str | None:
     """Return an error message if the largest blocks of all workers together exceed this machine's memory."""
     largest = sorted((planned.megabytes for planned in plan.blocks), reverse=True)[:n_workers]
     if 1e6 * sum(largest) <= free_bytes:
         return None
-    a, b = asked.shape
+    a, b = training.shape
     finer = f"{2 * a}x{b}" if a <= b else f"{a}x{2 * b}"
     is_one = len(largest) == 1
     which = "the largest block takes" if is_one else f"the {len(largest)} largest blocks take"
@@ -183,26 +183,26 @@ def too_large(asked: Asked, plan: Plan, n_workers: int, free_bytes: float) -> st
     )
 
 
-def save_plan(asked: Asked, plan: Plan) -> None:
+def save_plan(training: BlockTraining, plan: Plan) -> None:
     """Write ``plan.json``, after everything that it refers to."""
-    run_folder.write_json(asked.folder / PLAN, to_json(asked, plan))
+    run_folder.write_json(training.folder / PLAN, to_json(training, plan))
 
 
-def load_coarse(asked: Asked, scene: Scene) -> Coarse:
+def load_coarse(training: BlockTraining, scene: Scene) -> Coarse:
     """Read the coarse model, and its renderer with the scene's background."""
-    folder, settings = asked.run_folder_of(COARSE), asked.coarse
+    folder, settings = training.run_folder_for(COARSE), training.coarse
     model = load_model(folder, settings)
     return Coarse(model, choose_render_settings(settings, model, scene.background), scene.frame)
 
 
-def to_json(asked: Asked, plan: Plan) -> dict[str, Any]:
+def to_json(training: BlockTraining, plan: Plan) -> dict[str, Any]:
     """Return the content of ``plan.json``."""
     return {
-        "grid": list(asked.shape),
+        "grid": list(training.shape),
         "origin": plan.plane.origin.tolist(),
         "axes": plan.plane.axes.tolist(),
-        "coarse_iterations": asked.coarse.iterations,
-        "iterations": asked.coarse.iterations + sum(planned.iterations for planned in plan.blocks),
+        "coarse_iterations": training.coarse.iterations,
+        "iterations": training.coarse.iterations + sum(planned.iterations for planned in plan.blocks),
         "trained_pixels": plan.trained,
         "blocks": [
             {
@@ -246,13 +246,13 @@ def _planned(entry: dict[str, Any]) -> Planned:
     return Planned(block, int(entry["photographs"]), int(entry["iterations"]), int(entry["megabytes"]))
 
 
-def describe(asked: Asked, plan: Plan) -> str:
+def describe(training: BlockTraining, plan: Plan) -> str:
     """Return the plan in a line."""
     numbers = [planned.n_photographs for planned in plan.blocks]
-    total = asked.coarse.iterations + sum(planned.iterations for planned in plan.blocks)
+    total = training.coarse.iterations + sum(planned.iterations for planned in plan.blocks)
     return (
         f"{len(numbers)} blocks of {_range(numbers)} photographs, {total:,} iterations in all; {plan.trained:.0%} of"
-        f" the pixels are trained on; see {asked.folder / run_folder.BLOCK_PLAN}"
+        f" the pixels are trained on; see {training.folder / run_folder.BLOCK_PLAN}"
     )
 
 

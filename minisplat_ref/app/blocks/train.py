@@ -15,10 +15,10 @@ from minisplat_ref.app.blocks.picture import draw_plan
 from minisplat_ref.app.blocks.plan import (
     COARSE,
     PLAN,
-    Asked,
+    BlockTraining,
     Plan,
     describe,
-    load_asked,
+    load_block_training,
     load_coarse,
     load_plan,
     make_plan,
@@ -28,8 +28,8 @@ from minisplat_ref.app.blocks.plan import (
 from minisplat_ref.app.runs.cluster import Workers, carry_out_all
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import BLOCK_PLAN, has_begun
-from minisplat_ref.app.runs.settings import list_photographs, load_frame, load_photographs, recipe_of
-from minisplat_ref.app.runs.trainings import HEADINGS, status_of, train_here, words_of, words_to_end
+from minisplat_ref.app.runs.settings import configure_recipe, list_photographs, load_frame, load_photographs
+from minisplat_ref.app.runs.trainings import HEADINGS, find_status, spell_command, spell_remaining_command, train_here
 from minisplat_ref.app.runs.worker import Job
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.frames import return_camera
@@ -66,12 +66,12 @@ def check(settings: Settings, recipe: Recipe, state: TrainState) -> None:
         raise InputError(f"--blocks starts from a coarse model, which recipe {settings.recipe} cannot")
 
 
-def train_coarse(asked: Asked, workers: Workers) -> int:
+def train_coarse(training: BlockTraining, workers: Workers) -> int:
     """Train the coarse model to its end; return the exit code."""
-    return _train(asked, {COARSE: asked.coarse}, workers)
+    return _train(training, {COARSE: training.coarse}, workers)
 
 
-def plan_blocks(asked: Asked) -> Plan:
+def plan_blocks(training: BlockTraining) -> Plan:
     """Return the plan; make it, and its picture, if there is none yet.
 
     Raises
@@ -79,37 +79,39 @@ def plan_blocks(asked: Asked) -> Plan:
     InputError
         See :func:`.plan.make_plan`.
     """
-    plan = load_plan(asked.folder)
+    plan = load_plan(training.folder)
     if plan is not None:
         return plan
-    frame = load_frame(asked.run_folder_of(COARSE))
-    listing = list_photographs(asked.coarse)
-    scene = load_photographs(asked.coarse, frame, listing)
-    coarse = load_coarse(asked, scene)
+    frame = load_frame(training.run_folder_for(COARSE))
+    listing = list_photographs(training.coarse)
+    scene = load_photographs(training.coarse, frame, listing)
+    coarse = load_coarse(training, scene)
     centers = np.stack([return_camera(view.camera, frame).center for view in scene.train_views])  # [V, 3]
-    plan = make_plan(asked, listing, scene, coarse, centers)
-    draw_plan(plan, centers, coarse.means, asked.folder / BLOCK_PLAN)
-    save_plan(asked, plan)
-    print(describe(asked, plan))
+    plan = make_plan(training, listing, scene, coarse, centers)
+    draw_plan(plan, centers, coarse.means, training.folder / BLOCK_PLAN)
+    save_plan(training, plan)
+    print(describe(training, plan))
     return plan
 
 
-def train_blocks(asked: Asked, plan: Plan, workers: Workers) -> int:
+def train_blocks(training: BlockTraining, plan: Plan, workers: Workers) -> int:
     """Train all blocks to their ends; return the exit code."""
-    warning = too_large(asked, plan, max(workers.n, 1), free_bytes())
+    warning = too_large(training, plan, max(workers.n, 1), free_bytes())
     if workers.address is None and warning is not None:
         print(f"minisplat-ref: {warning}", file=sys.stderr)
-    return _train(asked, {planned.block.name: plan.settings_of(asked, planned) for planned in plan.blocks}, workers)
+    return _train(
+        training, {planned.block.name: plan.make_settings(training, planned) for planned in plan.blocks}, workers
+    )
 
 
-def merged(asked: Asked, plan: Plan) -> tuple[Scene, Recipe, TrainState]:
+def merge_blocks(training: BlockTraining, plan: Plan) -> tuple[Scene, Recipe, TrainState]:
     """Return the end of the run of the whole; parts that a merge leaves out are reported."""
-    scene = load_photographs(asked.settings)
-    state, left_out = merge(asked, plan, scene)
+    scene = load_photographs(training.settings)
+    state, left_out = merge(training, plan, scene)
     for sentence in left_out:
         print(f"minisplat-ref: {sentence}, which the merged model does not have")
-    write_history(asked, plan, state)
-    return scene, recipe_of(asked.settings), state
+    write_history(training, plan, state)
+    return scene, configure_recipe(training.settings), state
 
 
 def is_unfinished(folder: Path) -> bool:
@@ -117,23 +119,23 @@ def is_unfinished(folder: Path) -> bool:
     return (folder / PLAN).exists() and not has_begun(folder)
 
 
-def _train(asked: Asked, trainings: dict[str, Settings], workers: Workers) -> int:
+def _train(training: BlockTraining, trainings: dict[str, Settings], workers: Workers) -> int:
     """Complete trainings, one by one or by workers; return the exit code."""
-    jobs, folder = [], asked.folder.resolve()
+    jobs, folder = [], training.folder.resolve()
     for name, settings in trainings.items():
-        run = asked.run_folder_of(name)
-        status = status_of(run, settings)
+        run = training.run_folder_for(name)
+        status = find_status(run, settings)
         print(f"{_title(name)}, {settings.iterations} iterations{HEADINGS[status]}", flush=True)
         if status == "finished":
             continue
         if workers.is_used:
             jobs.append(Job(_title(name), next_words, (folder, name), run.resolve()))
             continue
-        words = words_to_end(run, settings, words_of(settings, run))
+        words = spell_remaining_command(run, settings, spell_command(settings, run))
         code = 0 if words is None else train_here(words)
         if code != 0:
             return code
-    inputs = [Path(asked.settings.scene)]
+    inputs = [Path(training.settings.scene)]
     return carry_out_all(workers, jobs, folder, inputs, lambda job: print(f"{job.name}: ended", flush=True))
 
 
@@ -143,12 +145,12 @@ def _title(name: str) -> str:
 
 def next_words(folder: Path, name: str) -> Sequence[str] | None:
     """Return the command that completes the training of a folder; called on the worker."""
-    asked = load_asked(folder)
+    training = load_block_training(folder)
     if name == COARSE:
-        settings = asked.coarse
+        settings = training.coarse
     else:
         plan = load_plan(folder)
         assert plan is not None
-        settings = next(plan.settings_of(asked, p) for p in plan.blocks if p.block.name == name)
-    run = asked.run_folder_of(name)
-    return words_to_end(run, settings, words_of(settings, run))
+        settings = next(plan.make_settings(training, p) for p in plan.blocks if p.block.name == name)
+    run = training.run_folder_for(name)
+    return spell_remaining_command(run, settings, spell_command(settings, run))

@@ -116,7 +116,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
+def _find_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; where the first word is an extension's name, of that extension's commands."""
     parser = build_parser()
     name = argv[0] if argv else ""
@@ -169,7 +169,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
-    parser = _parser_of(argv)
+    parser = _find_parser(argv)
     args = parser.parse_args(argv)
     args.words = tuple(argv)
     if args.run is None:

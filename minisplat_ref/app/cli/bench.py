@@ -1,4 +1,4 @@
-"""``bench``: what each backend and precision costs in time and in error, measured in one run."""
+"""``bench``: time and error of each backend and precision, measured in one run."""
 
 import argparse
 import sys
@@ -90,12 +90,12 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, print the table, write what was asked for."""
+    """Measure, print the table, write the requested files."""
     return publish(_measure(args), args)
 
 
 def publish(report: "Report", args: argparse.Namespace) -> int:
-    """Print tables and verdict, write the files that were asked for; return 1 where a case failed, else 0."""
+    """Print tables and verdict, write the requested files; return 1 where a case failed, else 0."""
     from minisplat_ref.oracle.cases import save_json, verdict
 
     print(f"{report.title}\n\n{_tables(report)}\n\n{verdict([report])}")
@@ -200,5 +200,5 @@ def _save_folder(report: "Report", folder: Path) -> None:
 
 
 def progress(line: str) -> None:
-    """Say on stderr what is being done."""
+    """Report the current step on stderr."""
     print(f"minisplat-ref: {line}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""``cache``: compiles all kernels ahead, says what is on disk, removes it."""
+"""``cache``: compiles all kernels ahead, lists them on disk, removes them."""
 
 import argparse
 import sys
@@ -92,7 +92,7 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _clear(args: argparse.Namespace) -> int:
-    """Remove the folders and say which."""
+    """Remove the folders and list them."""
     from minisplat_ref.jit.kernel_cache import kernel_folders, remove
 
     folders = [folder for folder in kernel_folders() if not (args.stale and folder.is_current)]

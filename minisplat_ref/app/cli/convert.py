@@ -65,7 +65,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the file, and say what is in it."""
+    """Write the file, and print its content."""
     from minisplat_ref.app.runs.conversion import check_population, choose_format, encode_as, open_source
     from minisplat_ref.io.formats import write_file
 
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write_page(args: argparse.Namespace) -> int:
-    """Write the model as a page that shows it, and say how to open it."""
+    """Write the model as a page that shows it, and print how to open it."""
     from minisplat_ref.app.runs.model_source import open_source
     from minisplat_ref.app.viewer.page import write_page
     from minisplat_ref.io.formats import write_content
@@ -132,15 +132,15 @@ def _write_page(args: argparse.Namespace) -> int:
 
 
 def _choose(args: argparse.Namespace, source: "Source", format_: "Format") -> "tuple[Choice, list[tuple[str, str]]]":
-    """Return the level that the command line asks for, and what was measured for it."""
+    """Return the requested level, and the measurements that led to it."""
     from minisplat_ref.app.runs import conversion
 
     gaussians = source.model.gaussians
     if args.max_bytes is not None:
         return conversion.finest_within(gaussians, format_, args.max_bytes), []
     if args.max_drop is not None:
-        judge = conversion.judge_of(source, args.input, args.scene, args.downscale)
-        choice = conversion.coarsest_within(gaussians, format_, args.max_drop, judge.psnr_of)
+        judge = conversion.make_judge(source, args.input, args.scene, args.downscale)
+        choice = conversion.coarsest_within(gaussians, format_, args.max_drop, judge.measure_psnr)
         return choice, [("PSNR", f"{choice.drop:.3f} dB lost on {judge.views}")]
     level = format_.default_level if args.level is None else args.level
     if level >= len(format_.levels):

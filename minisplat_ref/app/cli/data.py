@@ -33,7 +33,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fetch, and say how a scene is made of it; or list."""
+    """Fetch, and print how a scene is made of it; or list."""
     from minisplat_ref.datasets.catalogue import find
     from minisplat_ref.errors import InputError
 

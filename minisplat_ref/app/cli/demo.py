@@ -49,7 +49,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the scene, train, write the report, and say where it is."""
+    """Make the scene, train, write the report, and print where it is."""
     from minisplat_ref.app.runs import run_folder
     from minisplat_ref.app.runs.demo_report import report_html, view_images
     from minisplat_ref.app.runs.first_use import compile_kernels

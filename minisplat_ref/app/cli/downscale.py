@@ -31,7 +31,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the images, and say where they are."""
+    """Write the images, and print where they are."""
     from minisplat_ref.datasets.downscale import downscale_images
 
     images = args.scene / "images"

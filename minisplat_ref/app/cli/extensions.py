@@ -1,4 +1,4 @@
-"""``extensions``: which relatives of 3DGS there are, and what each brings."""
+"""``extensions``: lists the relatives of 3DGS, and the content of each."""
 
 import argparse
 from typing import TYPE_CHECKING
@@ -64,7 +64,7 @@ def _describe(name: str) -> None:
         "recipes": ", ".join(recipe.name for recipe in extension.recipes),
         "trains": extension.representation.name,
         "losses": ", ".join(term.name for term in extension.losses),
-        "commands": ", ".join(f"minisplat-ref {name} {command}" for command in _commands_of(extension)),
+        "commands": ", ".join(f"minisplat-ref {name} {command}" for command in _list_commands(extension)),
         "formats": ", ".join(f"{format_.suffix} ({format_.summary})" for format_ in extension.formats),
     }
     print()
@@ -73,7 +73,7 @@ def _describe(name: str) -> None:
             print(f"{label:<8}  {value}")
 
 
-def _commands_of(extension: "Extension") -> list[str]:
+def _list_commands(extension: "Extension") -> list[str]:
     """Return the names of an extension's commands, which are not always those of their modules."""
     commands = argparse.ArgumentParser().add_subparsers()
     for module in extension.commands:

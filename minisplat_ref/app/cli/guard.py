@@ -1,4 +1,4 @@
-"""What surrounds a command: errors in one line and the exit codes that belong to them, warnings in one line."""
+"""The guard around a command: errors and warnings in one line each, and the exit codes of errors."""
 
 import io
 import logging
@@ -13,7 +13,7 @@ from typing import TextIO
 from minisplat_ref.errors import InputError, InputWarning
 
 EXTRAS = {"matplotlib": "photos"}
-"""Packages that commands draw with, by the extra that brings them."""
+"""Packages for figures, by the extra that installs them."""
 
 
 def run_guarded(work: Callable[[], int], program: str = "minisplat-ref") -> int:
@@ -59,7 +59,7 @@ def run_guarded(work: Callable[[], int], program: str = "minisplat-ref") -> int:
 
 
 def check_packages(needed: Sequence[str]) -> None:
-    """Refuse a command before it begins whose end would need a package that is not there."""
+    """Refuse a command that would fail at its end for lack of a package."""
     for package in needed:
         if find_spec(package) is None:
             raise InputError(_missing(package))

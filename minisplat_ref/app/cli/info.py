@@ -1,4 +1,4 @@
-"""``info``: what is in a PLY, a checkpoint, a run or a scene."""
+"""``info``: the content of a PLY, a checkpoint, a run or a scene."""
 
 import argparse
 import math
@@ -97,7 +97,7 @@ def _ply_rows(path: Path) -> Rows:
 
 
 def _label_rows(label: "Label") -> Rows:
-    """Say how a file is drawn, and what it lacks of its run."""
+    """Return rows about the renderer of a file, and the parts of its run that it lacks."""
     from minisplat_ref.app.runs.model_file import describe_parts
 
     settings = f", with {', '.join(label.set)}" if label.set else ""
@@ -174,11 +174,11 @@ def _run_rows(folder: Path) -> Rows:
 
 
 def _state_of_run(folder: Path, iterations: int) -> str:
-    from minisplat_ref.app.runs.checkpoints import step_of
+    from minisplat_ref.app.runs.checkpoints import read_step
     from minisplat_ref.app.runs.run_folder import has_begun, is_finished
 
     going_on = f"minisplat-ref train --resume {folder}"
-    step = step_of(folder)
+    step = read_step(folder)
     if step is None:
         return "complete, without a checkpoint" if has_begun(folder) else f"has not begun: {going_on}"
     if step < iterations and not is_finished(folder, iterations):
@@ -191,7 +191,7 @@ def _state_of_run(folder: Path, iterations: int) -> str:
 
 
 def _event_rows(folder: Path, settings: "Settings") -> Rows:
-    """Say which mechanisms of the recipe were active, and which never."""
+    """Return rows about the mechanisms of the recipe that were active, and those that never were."""
     from minisplat_ref.app.runs.events import count_published_times, describe, never_fired, read_mechanisms
     from minisplat_ref.app.runs.run_folder import EVENTS, is_finished
     from minisplat_ref.extensions.extension import find_recipe
@@ -280,7 +280,7 @@ def _size(path: Path) -> str:
 
 
 def _says(value: Any) -> bool:
-    """Return whether a setting or measure says anything: not what was not given, not measured or switched off."""
+    """Return whether a setting or metric is worth a row: it was given, measured or switched on."""
     return value is not None and value is not False and value != {}
 
 

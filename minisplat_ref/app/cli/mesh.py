@@ -52,21 +52,21 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fuse, write the mesh and its page, and say what they hold."""
+    """Fuse, write the mesh and its page, and print their content."""
     from minisplat_ref.app.runs.depth_maps import DepthKind
     from minisplat_ref.app.runs.mesh_report import report_html
-    from minisplat_ref.app.runs.meshing import Asked, mesh_run, open_for_mesh
+    from minisplat_ref.app.runs.meshing import MeshOptions, mesh_run, open_for_mesh
     from minisplat_ref.io.formats import write_content
     from minisplat_ref.mechanisms.meshes.files import check_suffix, write_mesh
 
     check_suffix(args.out)
     kind = DepthKind(args.depth)
-    asked = Asked(args.folder, kind, args.voxel, args.unbounded, args.min_views, args.parts)
+    options = MeshOptions(args.folder, kind, args.voxel, args.unbounded, args.min_views, args.parts)
     opened = open_for_mesh(args.folder)
-    meshed = mesh_run(opened, asked)
+    meshed = mesh_run(opened, options)
     write_mesh(args.out, meshed.mesh)
     html = args.out.with_suffix(".html")
-    write_content(html, report_html(opened, asked, meshed, args.out).encode())
+    write_content(html, report_html(opened, options, meshed, args.out).encode())
     size = " x ".join(map(str, meshed.shape))
     print(
         f"{len(meshed.mesh.faces):,} triangles in {args.out}: {meshed.n_views} views on {size} voxels of"

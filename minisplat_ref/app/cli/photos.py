@@ -59,7 +59,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the steps that have not been done, and say where their results are."""
+    """Do the remaining steps, and print where their results are."""
     from minisplat_ref.app.reports.commands import command
     from minisplat_ref.app.runs import run_folder, settings
     from minisplat_ref.app.runs.next_steps import live_view

@@ -49,7 +49,7 @@ LIST = "pictures.json"  # what a rendering has left in its folder, so that the n
 ENDS = (".png", "_depth.png", "_depth.npy", "_albedo.png", "_metallic.png", "_roughness.png", "_normal.png")
 MAPS = ("albedo", "metallic", "roughness", "normal")
 PART = 25  # images that a worker renders before it is given others
-ORBIT_SIZE = (640, 480)  # pixels, where no run says otherwise
+ORBIT_SIZE = (640, 480)  # pixels, unless the run has another size
 
 
 def add_parser(commands: Commands) -> None:
@@ -136,14 +136,14 @@ def run(args: argparse.Namespace) -> int:
         source.trained.render(view_from(view.camera, time=view.time if args.time is None else args.time), wants)
         for view in views[part]
     )
-    first = next(outputs)  # what cannot be drawn is refused before the folder is touched
+    first = next(outputs)  # what cannot be rendered is refused before the folder is touched
     if args.part is None:
         _make_room(out, names)
     workers = Workers(args.workers, args.cluster)
     if workers.is_used:
         return _hand_out(workers, args, out, names)
-    drawn = with_progress(chain([first], outputs), "rendering", "views", total=len(views[part]))
-    for name, output in zip(names[part], drawn, strict=True):
+    rendered = with_progress(chain([first], outputs), "rendering", "views", total=len(views[part]))
+    for name, output in zip(names[part], rendered, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
             sums = output.image[..., channels["depth"].start]
@@ -159,7 +159,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _finish(args: argparse.Namespace, out: Path, names: Sequence[str]) -> None:
-    """Say what there is, and make the film of it."""
+    """Print where the images are, and make the film of them."""
     from minisplat_ref.app.film import write_film
 
     print(f"{len(names)} images in {out}")
@@ -188,7 +188,7 @@ def _words_of_part(words: Sequence[str], part: str) -> list[str]:
 
 
 def _channels(args: argparse.Namespace, source: "Source", wants: frozenset[str]) -> dict[str, slice]:
-    """Return the channels that are drawn, by name.
+    """Return the rendered channels, by name.
 
     Raises
     ------

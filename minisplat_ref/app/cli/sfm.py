@@ -1,4 +1,4 @@
-"""``sfm``: finds out from which places photographs were taken."""
+"""``sfm``: finds the cameras of photographs."""
 
 import argparse
 from pathlib import Path
@@ -77,7 +77,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the scene, say how it was found, and how to train on it."""
+    """Make the scene, print how it was found, and how to train on it."""
     from minisplat_ref.datasets.sfm import default_matching, run_sfm
 
     matching = args.matching or default_matching(args.photos)

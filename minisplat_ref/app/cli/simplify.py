@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from minisplat_ref.interface.arguments import Commands, HelpFormatter, decibels, integer
 
 if TYPE_CHECKING:
-    from minisplat_ref.app.runs.simplified_run import Asked
+    from minisplat_ref.app.runs.simplified_run import SimplifyOptions
 
 FINE_TUNE = 300  # iterations at each size
 
@@ -63,15 +63,15 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs.first_use import compile_kernels
     from minisplat_ref.app.runs.settings import load
     from minisplat_ref.app.runs.simplification import Target
-    from minisplat_ref.app.runs.simplified_run import Asked
+    from minisplat_ref.app.runs.simplified_run import SimplifyOptions
 
     compile_kernels(load(args.folder).backend)
     target = Target(args.max_drop, args.budget, args.max_bytes)
-    simplify(Asked(args.folder, args.out, target, args.fine_tune, args.scene))
+    simplify(SimplifyOptions(args.folder, args.out, target, args.fine_tune, args.scene))
     return 0
 
 
-def simplify(asked: "Asked") -> None:
+def simplify(options: "SimplifyOptions") -> None:
     """Simplify a run and print how that went.
 
     Raises
@@ -88,11 +88,11 @@ def simplify(asked: "Asked") -> None:
     from minisplat_ref.app.runs.simplified_run import simplify_run
     from minisplat_ref.interface.reporting import markdown_table
 
-    result = simplify_run(asked)
+    result = simplify_run(options)
     print(markdown_table(TABLE_HEADING, table_rows(result)))
     print(describe_decision(result))
     if result["is_all_that_matter"]:
         n = result["chosen"]["n_gaussians"]
-        print(f"minisplat-ref: {asked.target} is more than all {n:,} Gaussians that matter", file=sys.stderr)
-    print(f"results in {asked.out}: point_cloud.ply, metrics.json, report.html")
+        print(f"minisplat-ref: {options.target} is more than all {n:,} Gaussians that matter", file=sys.stderr)
+    print(f"results in {options.out}: point_cloud.ply, metrics.json, report.html")
     print(describe_outcome(result))

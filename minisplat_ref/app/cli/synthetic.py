@@ -67,7 +67,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Trace the scene, write it, and say what it holds."""
+    """Trace the scene, write it, and print its content."""
     from functools import partial
 
     from minisplat_ref.datasets.synthetic import make_scene

@@ -72,7 +72,7 @@ def add_parser(commands: Commands) -> None:
 
 
 @dataclass(frozen=True)
-class Request:
+class TrainOptions:
     """The arguments of ``train``, read from the command line once."""
 
     given: Mapping[str, Any]
@@ -95,8 +95,8 @@ class Request:
     server: Any = None
     """The viewer's, which takes the port before the scene is read."""
 
-    def with_config(self) -> "Request":
-        """Return the request with the settings of --config where the command line has none."""
+    def with_config(self) -> "TrainOptions":
+        """Return the options with the settings of --config where the command line has none."""
         if self.config is None:
             return self
         from minisplat_ref.app.runs.run_folder import CONFIG
@@ -128,48 +128,48 @@ class Request:
         return replace(settings, schedule_iterations=settings.iterations) if self.rescale else settings
 
 
-def read_request(args: argparse.Namespace) -> Request:
-    """Return the request of parsed arguments."""
+def read_options(args: argparse.Namespace) -> TrainOptions:
+    """Return the options of parsed arguments."""
     given = {name: getattr(args, name) for name in OPTIONS if name in args}
-    return Request(given, **{f.name: getattr(args, f.name) for f in fields(Request) if f.name in args})
+    return TrainOptions(given, **{f.name: getattr(args, f.name) for f in fields(TrainOptions) if f.name in args})
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, or continue a training; nothing is written before the input has been read and found good."""
     from minisplat_ref.training.interruption import terminated_like_interrupted
 
-    request = read_request(args)
-    if request.view is not None:
+    options = read_options(args)
+    if options.view is not None:
         from minisplat_ref.app.viewer.browser import open_server
 
-        request = replace(request, server=open_server(request.view, "training"))
+        options = replace(options, server=open_server(options.view, "training"))
     with terminated_like_interrupted():
-        return _begin(request.with_config()) if request.resume is None else _resume(request.resume, request)
+        return _begin(options.with_config()) if options.resume is None else _resume(options.resume, options)
 
 
-def _begin(request: Request) -> int:
+def _begin(options: TrainOptions) -> int:
     """Begin a training, of the whole scene or in blocks."""
-    settings = request.new_settings()
-    assert request.scene is not None
-    if request.blocks is not None and settings.block is not None:
+    settings = options.new_settings()
+    assert options.scene is not None
+    if options.blocks is not None and settings.block is not None:
         raise InputError("--block is one part of a training in --blocks: give one of the two")
-    scene = Path(request.scene)
+    scene = Path(options.scene)
     scene_folder = scene.parent if scene.is_file() else scene
-    folder = request.out or Path("runs") / f"{scene_folder.resolve().name}-{settings.recipe}"
+    folder = options.out or Path("runs") / f"{scene_folder.resolve().name}-{settings.recipe}"
 
     from minisplat_ref.app.cli import train_blocks, train_whole
 
-    if request.blocks is not None:
-        return train_blocks.begin(folder, settings, request.blocks, request)
-    if request.workers or request.cluster:
+    if options.blocks is not None:
+        return train_blocks.begin(folder, settings, options.blocks, options)
+    if options.workers or options.cluster:
         raise InputError("--workers and --cluster train blocks at once: give --blocks AxB, too, or leave them out")
-    return train_whole.begin(folder, settings, request)
+    return train_whole.begin(folder, settings, options)
 
 
-def _resume(folder: Path, request: Request) -> int:
+def _resume(folder: Path, options: TrainOptions) -> int:
     """Continue a training, of the whole scene or in blocks."""
-    surplus = [name for name in ("scene", "out", "config") if getattr(request, name) is not None]
-    surplus += [name for name in OPTIONS if name in request.given and name not in NEW_ON_RESUME]
+    surplus = [name for name in ("scene", "out", "config") if getattr(options, name) is not None]
+    surplus += [name for name in OPTIONS if name in options.given and name not in NEW_ON_RESUME]
     if surplus:
         raise InputError(
             f"--resume takes the run's own settings: leave out {', '.join(option_name(name) for name in surplus)}"
@@ -178,7 +178,7 @@ def _resume(folder: Path, request: Request) -> int:
     from minisplat_ref.app.blocks.train import is_unfinished
     from minisplat_ref.app.cli import train_blocks, train_whole
 
-    return train_blocks.resume(folder, request) if is_unfinished(folder) else train_whole.resume(folder, request)
+    return train_blocks.resume(folder, options) if is_unfinished(folder) else train_whole.resume(folder, options)
 
 
 def _default_iterations(name: str) -> int:

@@ -10,8 +10,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import option_name
 
 if TYPE_CHECKING:
-    from minisplat_ref.app.blocks.plan import Asked
-    from minisplat_ref.app.cli.train import Request
+    from minisplat_ref.app.blocks.plan import BlockTraining
+    from minisplat_ref.app.cli.train import TrainOptions
     from minisplat_ref.app.runs.cluster import Workers
     from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.training.state import TrainState
@@ -31,92 +31,92 @@ WHOLE_ONLY = {
 """Options that a training in blocks refuses, and what to do or why."""
 
 
-def begin(folder: Path, settings: Settings, shape: tuple[int, int], request: "Request") -> int:
+def begin(folder: Path, settings: Settings, shape: tuple[int, int], options: "TrainOptions") -> int:
     """Begin a training in blocks in a new folder; return the exit code."""
     import numpy as np
 
     from minisplat_ref.app.blocks.grid import divide, ground_plane
-    from minisplat_ref.app.blocks.plan import Asked, create_folder
+    from minisplat_ref.app.blocks.plan import BlockTraining, create_folder
     from minisplat_ref.app.blocks.train import check
     from minisplat_ref.app.runs import run_folder
     from minisplat_ref.app.runs.preparation import prepare
     from minisplat_ref.app.runs.settings import to_config
 
-    _refuse_options(settings, request)
+    _refuse_options(settings, options)
     run_folder.check_free(folder)
-    training = prepare(folder, settings)
-    recipe, scene = training.recipe, training.scene
-    check(settings, recipe, training.state)
+    whole = prepare(folder, settings)
+    recipe, scene = whole.recipe, whole.scene
+    check(settings, recipe, whole.state)
     centers = np.stack([view.camera.center for view in scene.train_views])
     divide(ground_plane(centers).coordinates(centers), shape)
-    asked = Asked(folder, settings, shape)
-    create_folder(asked, to_config(settings, recipe, scene))
-    return _complete(asked, request)
+    training = BlockTraining(folder, settings, shape)
+    create_folder(training, to_config(settings, recipe, scene))
+    return _complete(training, options)
 
 
-def _refuse_options(settings: Settings, request: "Request") -> None:
+def _refuse_options(settings: Settings, options: "TrainOptions") -> None:
     """Refuse options of a training of the whole, unless they say what holds without them, as those of --config may."""
-    given = {**vars(settings), "preview": request.preview or None, "view": request.view}
+    given = {**vars(settings), "preview": options.preview or None, "view": options.view}
     for name, instead in WHOLE_ONLY.items():
         if given[name] != getattr(Settings, name, None):
             raise InputError(f"{option_name(name)} does not go with --blocks ({instead}): leave it out")
 
 
-def resume(folder: Path, request: "Request") -> int:
+def resume(folder: Path, options: "TrainOptions") -> int:
     """Continue the training in blocks in a folder; return the exit code."""
-    from minisplat_ref.app.blocks.plan import load_asked
+    from minisplat_ref.app.blocks.plan import load_block_training
 
-    surplus = [option_name(name) for name in NEW_ON_RESUME if name in request.given]
-    surplus += ["--scene"] if request.moved is not None else []
-    surplus += ["--rescale"] if request.rescale else []
+    surplus = [option_name(name) for name in NEW_ON_RESUME if name in options.given]
+    surplus += ["--scene"] if options.moved is not None else []
+    surplus += ["--rescale"] if options.rescale else []
     if surplus:
         raise InputError(f"the blocks of {folder} have not ended: leave out {surplus[0]}")
-    return _complete(load_asked(folder), request)
+    return _complete(load_block_training(folder), options)
 
 
-def _complete(asked: "Asked", request: "Request") -> int:
+def _complete(training: "BlockTraining", options: "TrainOptions") -> int:
     """Train in blocks from where that is, and end like a run of the whole; return the exit code."""
     from minisplat_ref.app.cli.train_whole import complete
     from minisplat_ref.app.runs.cluster import Workers
     from minisplat_ref.app.runs.run import Training
     from minisplat_ref.app.runs.run_folder import hold_folder
 
-    end = _train_blocks(asked, Workers(request.workers, request.cluster))
+    end = _train_blocks(training, Workers(options.workers, options.cluster))
     if isinstance(end, int):
         return end
-    with hold_folder(asked.folder):
+    with hold_folder(training.folder):
         scene, recipe, state = end
-        return complete(Training(asked.folder, scene, asked.settings, recipe, state), request)
+        return complete(Training(training.folder, scene, training.settings, recipe, state), options)
 
 
-def _train_blocks(asked: "Asked", workers: "Workers") -> "tuple[Scene, Recipe, TrainState] | int":
+def _train_blocks(training: "BlockTraining", workers: "Workers") -> "tuple[Scene, Recipe, TrainState] | int":
     """Do what is left of the four phases; return what the run of the whole ends with, or an exit code."""
-    from minisplat_ref.app.blocks.train import merged, plan_blocks, train_blocks, train_coarse
+    from minisplat_ref.app.blocks.train import merge_blocks, plan_blocks, train_blocks, train_coarse
     from minisplat_ref.app.runs.worker import INTERRUPTED
 
     try:
-        code = train_coarse(asked, workers)
+        code = train_coarse(training, workers)
         if code == 0:
-            plan = plan_blocks(asked)
-            code = train_blocks(asked, plan, workers)
+            plan = plan_blocks(training)
+            code = train_blocks(training, plan, workers)
             if code == 0:
-                return merged(asked, plan)
+                return merge_blocks(training, plan)
     except KeyboardInterrupt:
         code = INTERRUPTED
     if code == INTERRUPTED:
-        how = f"minisplat-ref train --resume {asked.folder}"
+        how = f"minisplat-ref train --resume {training.folder}"
         print(f"minisplat-ref: interrupted; to continue: {how}", file=sys.stderr)
     else:
-        _remove_if_unused(asked)
+        _remove_if_unused(training)
     return code
 
 
-def _remove_if_unused(asked: "Asked") -> None:
+def _remove_if_unused(training: "BlockTraining") -> None:
     """Take back the folder if even the coarse training was refused."""
     from minisplat_ref.app.blocks.plan import COARSE, PLAN
 
-    if asked.run_folder_of(COARSE).exists():
+    if training.run_folder_for(COARSE).exists():
         return
-    (asked.folder / PLAN).unlink()
-    shutil.rmtree(asked.blocks_folder)
-    asked.folder.rmdir()
+    (training.folder / PLAN).unlink()
+    shutil.rmtree(training.blocks_folder)
+    training.folder.rmdir()

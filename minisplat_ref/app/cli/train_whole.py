@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
-    from minisplat_ref.app.cli.train import Request
+    from minisplat_ref.app.cli.train import TrainOptions
     from minisplat_ref.app.runs.options import Settings
     from minisplat_ref.app.runs.run import Training, Watch
     from minisplat_ref.app.runs.simplification import Target
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 SIMPLIFIED = "simplified"  # the run inside of a run that --max-drop and --max-bytes leave
 
 
-def begin(folder: Path, settings: "Settings", request: "Request") -> int:
+def begin(folder: Path, settings: "Settings", options: "TrainOptions") -> int:
     """Begin a training in a new folder; return the exit code."""
     from minisplat_ref.app.runs import run_folder
     from minisplat_ref.app.runs.first_use import compile_kernels
@@ -34,21 +34,21 @@ def begin(folder: Path, settings: "Settings", request: "Request") -> int:
     warn_of_scene(scene, is_dense=training.recipe.starts_densely)
     if settings.block is None:  # else the training of the whole has reported it
         report_inventory(Path(settings.scene), scene, settings.model)
-    if "downscale" not in request.given:
+    if "downscale" not in options.given:
         proposal = propose(scene, state.model, training.render_settings(state.model), settings.downscale)
         if proposal is not None:
             print(f"minisplat-ref: {proposal}", file=sys.stderr)
     with run_folder.hold_folder(folder):
         run_folder.check_free(folder)  # another process may have trained there meanwhile
         try:
-            return complete(training, request, memory_note)
+            return complete(training, options, memory_note)
         except InputError:
             if state.step == 0:
                 run_folder.remove(folder)
             raise
 
 
-def resume(folder: Path, request: "Request") -> int:
+def resume(folder: Path, options: "TrainOptions") -> int:
     """Continue the training in a folder; return the exit code."""
     from minisplat_ref.app.runs import checkpoints, run_folder
     from minisplat_ref.app.runs.first_use import compile_kernels
@@ -57,15 +57,15 @@ def resume(folder: Path, request: "Request") -> int:
 
     trained_with = load(folder)  # before the folder is held: without a run there is none
     with run_folder.hold_folder(folder):
-        settings = request.continued_settings(trained_with)
+        settings = options.continued_settings(trained_with)
         state = checkpoints.load(folder, settings) if run_folder.has_begun(folder) else None
         if state is not None:
             _check_unfinished(folder, state, settings.iterations)
         training = prepare_continued(folder, settings, state)
         memory_note = check_memory(training)
         compile_kernels(settings.backend)
-        print(_describe_schedule(training.state.step, settings, is_rescaled=request.rescale))
-        return complete(training, request, memory_note)
+        print(_describe_schedule(training.state.step, settings, is_rescaled=options.rescale))
+        return complete(training, options, memory_note)
 
 
 def _check_unfinished(folder: Path, state: "TrainState", iterations: int) -> None:
@@ -95,7 +95,7 @@ def _describe_schedule(step: int, settings: "Settings", is_rescaled: bool) -> st
     return how
 
 
-def complete(training: "Training", request: "Request", memory_note: str = "") -> int:
+def complete(training: "Training", options: "TrainOptions", memory_note: str = "") -> int:
     """Train to the end, print the results, and simplify them on request; return the exit code."""
     from minisplat_ref.app.runs import checkpoints, run_folder
     from minisplat_ref.app.runs.model_file import describe_parts, missing_parts
@@ -115,16 +115,16 @@ def complete(training: "Training", request: "Request", memory_note: str = "") ->
         print(place)
     if memory_note:
         print(memory_note)
-    training = training._replace(watches=_make_watches(request))
-    if request.check_every is not None:
-        training = training._replace(check_every=request.check_every)
+    training = training._replace(watches=_make_watches(options))
+    if options.check_every is not None:
+        training = training._replace(check_every=options.check_every)
     outcome = run_training(training)
     if outcome.evaluation is None or not outcome.is_complete:
         if state.is_whole:
             measured = "" if outcome.evaluation else " but not measured"
             how = f"stopped after {state.step} of {settings.iterations} iterations, all saved{measured}"
         else:
-            how = f"stopped in the middle of iteration {state.step + 1}, saved is {checkpoints.step_of(folder)}"
+            how = f"stopped in the middle of iteration {state.step + 1}, saved is {checkpoints.read_step(folder)}"
         print(f"minisplat-ref: {how}; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
         return 130
     print(
@@ -143,24 +143,24 @@ def complete(training: "Training", request: "Request", memory_note: str = "") ->
     return 0 if target is None else _simplify(folder, target)
 
 
-def _make_watches(request: "Request") -> "list[Watch]":
+def _make_watches(options: "TrainOptions") -> "list[Watch]":
     """Return what shows the training to a person; print where."""
     from minisplat_ref.app.runs.preview import make_preview
 
-    watches: list[Watch] = [make_preview] if request.preview else []
-    if request.server is not None:
+    watches: list[Watch] = [make_preview] if options.preview else []
+    if options.server is not None:
         from minisplat_ref.app.viewer.browser import address
         from minisplat_ref.app.viewer.live import make_live_view
 
-        print(f"open {address(request.server)} in a browser to watch")
-        watches.append(make_live_view(request.server))
+        print(f"open {address(options.server)} in a browser to watch")
+        watches.append(make_live_view(options.server))
     return watches
 
 
 def _simplify(folder: Path, target: "Target") -> int:
     """Make the finished run smaller; return the exit code."""
     from minisplat_ref.app.cli.simplify import FINE_TUNE, simplify
-    from minisplat_ref.app.runs.simplified_run import Asked
+    from minisplat_ref.app.runs.simplified_run import SimplifyOptions
 
     out = folder / SIMPLIFIED
     if out.exists():
@@ -168,7 +168,7 @@ def _simplify(folder: Path, target: "Target") -> int:
         print(f"minisplat-ref: {out} is of an earlier end of the run; for a new one: {command}", file=sys.stderr)
         return 0
     try:
-        simplify(Asked(folder, out, target, FINE_TUNE))
+        simplify(SimplifyOptions(folder, out, target, FINE_TUNE))
     except KeyboardInterrupt:
         command = f"minisplat-ref simplify {folder} --out {out} {target}"
         print(f"minisplat-ref: trained, but not simplified; to do so: {command}", file=sys.stderr)

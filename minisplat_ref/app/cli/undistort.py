@@ -35,7 +35,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the copy, and say where it is."""
+    """Write the copy, and print where it is."""
     from minisplat_ref.datasets.undistort import undistort_scene
 
     undistort_scene(args.scene, args.out)

@@ -33,17 +33,17 @@ def color(index: int) -> str:
 
 
 def psnr_over_time(curves: Curves) -> Figure:
-    """Draw the PSNR of the test views over the training time: a line per run, a colour per recipe, a star its best."""
+    """Plot the PSNR of the test views over the training time: a line per run, a colour per recipe, a star its best."""
     return _over(curves, "seconds", "psnr", "PSNR of the test views (dB)", "training time (s)")
 
 
 def psnr_over_iterations(curves: Curves) -> Figure:
-    """Draw the same over the iterations."""
+    """Plot the PSNR of the test views over the iterations."""
     return _over(curves, "step", "psnr", "PSNR of the test views (dB)", "iterations")
 
 
 def chamfer_over_iterations(curves: Curves) -> Figure:
-    """Draw the distance to the true surface over the iterations, where it is known."""
+    """Plot the distance to the true surface over the iterations, where it is known."""
     return _over(curves, "step", "chamfer", "Chamfer distance to the true surface (extents)", "iterations")
 
 
@@ -78,7 +78,7 @@ def _over(curves: Curves, x: str, y: str, title: str, x_label: str) -> Figure:
 
 
 def psnr_over_count(curves: Curves) -> Figure:
-    """Draw the PSNR of the test views over the number of Gaussians: the way there thin, the end as a disc."""
+    """Plot the PSNR of the test views over the number of Gaussians: the way there thin, the end as a disc."""
     with plot("PSNR of the test views (dB)", "Gaussians", SIZE) as (figure, axes):
         for index, (recipe, runs) in enumerate(curves.items()):
             for number, records in enumerate(runs):
@@ -104,7 +104,7 @@ def psnr_over_count(curves: Curves) -> Figure:
 
 
 def gallery(crops: Sequence[Crop], recipes: Sequence[str]) -> Figure:
-    """Draw the crops: a row each, the truth on the left, then a column per recipe."""
+    """Show the crops: a row each, the truth on the left, then a column per recipe."""
     n_columns = 1 + len(recipes)
     height, width = crops[0].truth.shape[:2]
     row_height = CROP_WIDTH * height / width + 0.3  # with its title

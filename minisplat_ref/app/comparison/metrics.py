@@ -87,13 +87,13 @@ class RecipeMetrics(NamedTuple):
         """Return whether a metric is one of each photograph, held out once."""
         return bool(self.photographs) and metric.key in PER_PHOTOGRAPH
 
-    def spread_of(self, metric: Metric) -> Spread:
+    def compute_spread(self, metric: Metric) -> Spread:
         """Return mean and standard deviation of a metric over the photographs, or else over the runs."""
-        return spread(self._values_of(metric))
+        return spread(self._collect_values(metric))
 
-    def error_of(self, metric: Metric) -> float | None:
+    def compute_error(self, metric: Metric) -> float | None:
         """Return the standard error of the mean; None of a single value, or where one lacks."""
-        values = self._values_of(metric)
+        values = self._collect_values(metric)
         std = spread(values).std
         return None if std is None else std / math.sqrt(len(values))
 
@@ -104,13 +104,13 @@ class RecipeMetrics(NamedTuple):
         is no part of the difference, nor is the difficulty of a photograph. None of a single pair, or where a value
         lacks.
         """
-        pairs = zip(self._values_of(metric), first._values_of(metric), strict=True)
+        pairs = zip(self._collect_values(metric), first._collect_values(metric), strict=True)
         differences = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
-        if len(differences) < max(2, len(self._values_of(metric))):
+        if len(differences) < max(2, len(self._collect_values(metric))):
             return None
         return float(np.std(differences, ddof=1) / math.sqrt(len(differences)))
 
-    def _values_of(self, metric: Metric) -> list[float | None]:
+    def _collect_values(self, metric: Metric) -> list[float | None]:
         sources = self.photographs.values() if self.is_per_photograph(metric) else self.runs
         return [source[metric.key] for source in sources]
 

@@ -1,11 +1,11 @@
-"""The plan of a comparison, kept in ``plan.json``: which recipe is trained with which seed, where, and for how long."""
+"""The plan of a comparison, kept in ``plan.json``: the recipe, seed, folder and length of each training."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.app.runs import run_folder
-from minisplat_ref.app.runs.start import start_from
+from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import list_scene, load_scene
@@ -80,7 +80,7 @@ class Plan(NamedTuple):
         given = {"lpips_weights": self.lpips_weights, "init": self.init}
         return {name: str(file.resolve()) for name, file in given.items() if file is not None}
 
-    def runs_of(self, recipe: str) -> list[Run]:
+    def list_runs(self, recipe: str) -> list[Run]:
         """Return the trainings of one recipe, in the order of the seeds."""
         return [run for run in self.runs if run.recipe == recipe]
 
@@ -94,7 +94,7 @@ class Plan(NamedTuple):
                 seed,
                 self.eval_every or max(1, round(iterations / POINTS_PER_RUN)),
                 self.folder / f"{recipe}{'' if self.folds is None else f'-fold{fold}'}-seed{seed}",
-                self._options_of(recipe),
+                self._list_options(recipe),
                 fold,
             )
             for seed in self.seeds
@@ -102,7 +102,7 @@ class Plan(NamedTuple):
             for recipe, iterations in zip(self.recipes, self.iterations, strict=True)
         ]
 
-    def _options_of(self, recipe: str) -> dict[str, object]:
+    def _list_options(self, recipe: str) -> dict[str, object]:
         return {name: value for name, value in self.options.items() if _takes(recipe, name)}
 
     @property
@@ -149,18 +149,18 @@ def check(plan: Plan) -> Scene:
             raise InputError(f"--{option.replace('_', '-')} means nothing to {', '.join(plan.recipes)}: leave it out")
     if plan.folds is not None:
         _check_folds(plan.scene, plan.folds)
-    scene = scene_of(plan)  # the first fold leaves the fewest photographs to train on
+    scene = load_fold(plan)  # the first fold leaves the fewest photographs to train on
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare on: give --test-every above 0")
     if plan.lpips_weights is not None:
         measured = scene.test_views if plan.folds is None else (*scene.train_views, *scene.test_views)
         check_views(load_network(plan.lpips_weights), measured)
     for recipe in recipes:
-        start_from(plan.init, scene, recipe, seed=0)
+        make_start(plan.init, scene, recipe, seed=0)
     return scene
 
 
-def scene_of(plan: Plan, fold: int = 0) -> Scene:
+def load_fold(plan: Plan, fold: int = 0) -> Scene:
     """Load the scene as the trainings of a fold have it."""
     return place_scene(load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every, offset=fold))
 

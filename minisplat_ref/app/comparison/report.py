@@ -137,7 +137,7 @@ def _photographs(plan: Plan, results: Results) -> list[str]:
 def _card(recipe: RecipeMetrics) -> tuple[str, str]:
     psnr, count, seconds, rate = (
         "null" if value is None else f"{value:{metric.format}}"
-        for metric, value in ((m, recipe.spread_of(m).mean) for m in METRICS)
+        for metric, value in ((m, recipe.compute_spread(m).mean) for m in METRICS)
         if metric.key in ("psnr", "n_gaussians", "train_seconds", "render_fps")
     )
     return f"{psnr} dB", f"{recipe.recipe}: {count} Gaussians, trained in {seconds} s, {rate} views/s"

@@ -16,7 +16,7 @@ from minisplat_ref.app.comparison.metrics import (
     read_photographs,
     relation,
 )
-from minisplat_ref.app.comparison.plan import Plan, scene_of
+from minisplat_ref.app.comparison.plan import Plan, load_fold
 from minisplat_ref.app.comparison.speed import render_rates
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
@@ -61,12 +61,12 @@ def collect(plan: Plan, scene: Scene) -> Results:
     rates: dict[Path, float] = {}
     for fold in range(plan.folds or 1):
         own = [run.folder for run in runs if run.fold == fold]
-        fold_scene = scene if fold == 0 else scene_of(plan, fold)
+        fold_scene = scene if fold == 0 else load_fold(plan, fold)
         rates |= zip(own, render_rates([models[folder] for folder in own], fold_scene), strict=True)
-    targets = {(run.seed, run.fold): final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
+    targets = {(run.seed, run.fold): final_psnr(run.folder) for run in plan.list_runs(plan.recipes[0])}
     recipes = []
     for recipe in plan.recipes:
-        own_runs = plan.runs_of(recipe)
+        own_runs = plan.list_runs(recipe)
         of_runs = [read_metrics(run.folder, targets[run.seed, run.fold], rates[run.folder]) for run in own_runs]
         photographs = NOTHING if plan.folds is None else read_photographs(run.folder for run in own_runs)
         recipes.append(RecipeMetrics(recipe, of_runs, photographs))
@@ -74,7 +74,7 @@ def collect(plan: Plan, scene: Scene) -> Results:
     metrics = run_folder.read_json_object(runs[0].folder / run_folder.METRICS)
     return Results(
         recipes=recipes,
-        curves={recipe: [read_curve(run.folder) for run in plan.runs_of(recipe)] for recipe in plan.recipes},
+        curves={recipe: [read_curve(run.folder) for run in plan.list_runs(recipe)] for recipe in plan.recipes},
         fired=read_fired(plan),
         crops=choose_crops(shown, scene),
         lpips_reason=metrics["lpips_reason"],
@@ -92,7 +92,7 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
             "scene": str(plan.scene.resolve()),
             "folder": str(plan.folder.resolve()),
             **plan.files,
-            "eval_every": [plan.runs_of(recipe)[0].eval_every for recipe in plan.recipes],
+            "eval_every": [plan.list_runs(recipe)[0].eval_every for recipe in plan.recipes],
         },
         "scene": {
             "name": scene.name,
@@ -119,20 +119,20 @@ def read_fired(plan: Plan) -> list[Fired]:
     for name, iterations in zip(plan.recipes, plan.iterations, strict=True):
         recipe = find_recipe(name)
         published = count_published_times(recipe)
-        runs = [read_mechanisms(run.folder / run_folder.EVENTS, published) for run in plan.runs_of(name)]
+        runs = [read_mechanisms(run.folder / run_folder.EVENTS, published) for run in plan.list_runs(name)]
         found.append(Fired(name, iterations, recipe.iterations, published, runs))
     return found
 
 
 def _recipe_to_json(plan: Plan, recipe: RecipeMetrics, first: RecipeMetrics, fired: Fired) -> dict[str, Any]:
-    spreads = {metric: recipe.spread_of(metric) for metric in METRICS}
-    runs = zip(plan.runs_of(recipe.recipe), recipe.runs, fired.runs, strict=True)
+    spreads = {metric: recipe.compute_spread(metric) for metric in METRICS}
+    runs = zip(plan.list_runs(recipe.recipe), recipe.runs, fired.runs, strict=True)
     return {
         "recipe": recipe.recipe,
         "mean": {metric.key: value.mean for metric, value in spreads.items()},
         "std": {metric.key: value.std for metric, value in spreads.items()},
         "relative_to_first": {
-            metric.key: relation(metric, value, first.spread_of(metric)) for metric, value in spreads.items()
+            metric.key: relation(metric, value, first.compute_spread(metric)) for metric, value in spreads.items()
         },
         "error_of_difference": {
             metric.key: recipe.error_of_difference(metric, first)
@@ -157,6 +157,8 @@ def _recipe_to_json(plan: Plan, recipe: RecipeMetrics, first: RecipeMetrics, fir
 def _validation_to_json(recipe: RecipeMetrics) -> dict[str, Any]:
     """Return what folds add to a recipe: the metrics of each photograph, and the errors of their means."""
     return {
-        "standard_error": {metric.key: recipe.error_of(metric) for metric in METRICS if metric.key in PER_PHOTOGRAPH},
+        "standard_error": {
+            metric.key: recipe.compute_error(metric) for metric in METRICS if metric.key in PER_PHOTOGRAPH
+        },
         "photographs": recipe.photographs,
     }

@@ -11,7 +11,7 @@ from typing import Any
 from minisplat_ref.app.comparison.plan import Plan, Run, load_plan
 from minisplat_ref.app.runs.cluster import Workers, carry_out_all
 from minisplat_ref.app.runs.options import Settings
-from minisplat_ref.app.runs.trainings import HEADINGS, Status, status_of, train_here, words_to_end
+from minisplat_ref.app.runs.trainings import HEADINGS, Status, find_status, spell_remaining_command, train_here
 from minisplat_ref.app.runs.worker import Job
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
@@ -40,7 +40,7 @@ def statuses(plan: Plan) -> list[Status]:
     InputError
         Instead of a run folder there is a run with other settings, or something else.
     """
-    return [status_of(run.folder, settings_of(plan, run)) for run in plan.runs]
+    return [find_status(run.folder, make_settings(plan, run)) for run in plan.runs]
 
 
 def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
@@ -116,7 +116,7 @@ def next_words(plan: Plan, number: int) -> list[str] | None:
         Index of the training in ``plan.runs``.
     """
     run = plan.runs[number]
-    return words_to_end(run.folder, settings_of(plan, run), _first_words(plan, run))
+    return spell_remaining_command(run.folder, make_settings(plan, run), _first_words(plan, run))
 
 
 def _first_words(plan: Plan, run: Run) -> list[str]:
@@ -131,7 +131,7 @@ def _name(plan: Plan, number: int) -> str:
     return f"run {number + 1} of {len(plan.runs)}: {run.recipe},{fold} seed {run.seed}, {run.iterations} iterations"
 
 
-def settings_of(plan: Plan, run: Run) -> Settings:
+def make_settings(plan: Plan, run: Run) -> Settings:
     """Return the settings with which ``train`` is called for a run, as its config.json has them."""
     return Settings(
         scene=str(plan.scene.resolve()),

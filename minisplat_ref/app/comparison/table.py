@@ -43,10 +43,10 @@ def _row(metric: Metric, recipes: Sequence[RecipeMetrics]) -> list[str]:
 
 
 def _value(metric: Metric, recipe: RecipeMetrics) -> str:
-    mean, std = recipe.spread_of(metric)
+    mean, std = recipe.compute_spread(metric)
     if mean is None:
         return _missing(metric, recipe)
-    width = recipe.error_of(metric) if recipe.is_per_photograph(metric) else std
+    width = recipe.compute_error(metric) if recipe.is_per_photograph(metric) else std
     deviation = "" if width is None else f" ± {width:{metric.format}}"
     return f"{mean:{metric.format}}{deviation}"
 
@@ -59,7 +59,7 @@ def _missing(metric: Metric, recipe: RecipeMetrics) -> str:
 
 
 def _relation(metric: Metric, recipe: RecipeMetrics, first: RecipeMetrics) -> str:
-    related = relation(metric, recipe.spread_of(metric), first.spread_of(metric))
+    related = relation(metric, recipe.compute_spread(metric), first.compute_spread(metric))
     if related is None:
         return ""
     if metric.relation == "ratio":

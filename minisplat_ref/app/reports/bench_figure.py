@@ -28,10 +28,10 @@ Style = dict[str, Any]
 
 
 def pareto_figure(cases: Sequence[Case]) -> "Figure":
-    """Draw every workload as a row: error of the image on the left, of the gradient on the right.
+    """Plot every workload as a row: error of the image on the left, of the gradient on the right.
 
     A marker is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error
-    of 0 is at the left edge. Failed contenders have no time and are not drawn. The step line is the Pareto front:
+    of 0 is at the left edge. Failed contenders have no time and are left out. The step line is the Pareto front:
     nothing is below and left of it.
 
     Parameters

@@ -59,7 +59,7 @@ def _tables(groups: Iterable[Sequence[Case]]) -> list[str]:
 def _settings(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the entries of one line each; lists of records are in the JSON file."""
     simple = [
-        (name.replace("_", " ").capitalize(), _in_words(value))
+        (name.replace("_", " ").capitalize(), _spell(value))
         for name, value in settings.items()
         if value is not None and not _is_records(value)
     ]
@@ -72,7 +72,7 @@ def _is_records(value: Any) -> bool:
     return isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value)
 
 
-def _in_words(value: Any) -> str:
+def _spell(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key}: {item}" for key, item in value.items())
     if isinstance(value, list | tuple):

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 from minisplat_ref import memory
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import CHECKPOINT, POINT_CLOUD, PREVIOUS, measured_step
-from minisplat_ref.app.runs.settings import load_model, recipe_of
+from minisplat_ref.app.runs.settings import configure_recipe, load_model
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.checkpoint import WAY_OUT, DamagedCheckpoint, load_checkpoint, load_metadata
 from minisplat_ref.training.saved_state import load_state, save_state
@@ -90,12 +90,12 @@ def load(folder: Path, settings: Settings) -> TrainState:
         length = recipe.get("iterations") if isinstance(recipe, dict) else None
         if type(length) is not int or length < 1:
             raise InputError(f"{path} does not say how long its schedule is; {WAY_OUT}")
-        return load_state(path, recipe_of(replace(settings, schedule_iterations=length)))
+        return load_state(path, configure_recipe(replace(settings, schedule_iterations=length)))
 
     return newest(folder, read)
 
 
-def step_of(folder: Path) -> int | None:
+def read_step(folder: Path) -> int | None:
     """Return the iteration of the newest checkpoint, None where there is none."""
     for path in (folder / CHECKPOINT, folder / PREVIOUS):
         with contextlib.suppress(DamagedCheckpoint):
@@ -120,7 +120,7 @@ def newest_model(folder: Path, settings: Settings) -> Saved:
     InputError
         There is neither, or the files are damaged.
     """
-    step = step_of(folder)
+    step = read_step(folder)
     if (folder / POINT_CLOUD).exists() and (step is None or (measured_step(folder) or 0) >= step):
         return Saved(load_model(folder, settings), None)
     if step is None:

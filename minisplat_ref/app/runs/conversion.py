@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.runs.model_file import label_for, read_model
+from minisplat_ref.app.runs.model_file import make_label, read_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, owner_of
 from minisplat_ref.io.formats import Format, with_label
@@ -33,7 +33,7 @@ class Source(NamedTuple):
     model: Model
     """In the frame of its scene's files."""
     owner: Extension
-    """Whose population it is."""
+    """The owner of the population."""
     what: str
     """In a few words."""
     frame: Frame = FILE_FRAME
@@ -69,14 +69,14 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     if path.is_dir() or is_checkpoint:
         if extension is not None:
             raise InputError(f"{path} has its extension recorded: leave out --extension {extension}")
-        return _of_checkpoint(path) if is_checkpoint else _of_run(path)
+        return _open_checkpoint(path) if is_checkpoint else _open_run(path)
     if not path.exists():
         raise InputError(f"{path} does not exist: give a run folder, a checkpoint, a PLY or a compact file")
     read = read_model(path, extension)
     return Source(Model(read.population), read.owner, path.name, frame_of_means(read.population.means), read.label)
 
 
-def _of_run(folder: Path) -> Source:
+def _open_run(folder: Path) -> Source:
     from minisplat_ref.app.runs.checkpoints import newest_model
     from minisplat_ref.app.runs.settings import find_owner, load, load_frame, return_model
 
@@ -84,11 +84,11 @@ def _of_run(folder: Path) -> Source:
     saved = newest_model(folder, settings)
     what = "the run's result" if saved.unfinished is None else f"iteration {saved.unfinished}"
     owner, frame = find_owner(settings), load_frame(folder)
-    label = label_for(owner, saved.model.shared, settings.set)
+    label = make_label(owner, saved.model.shared, settings.set)
     return Source(return_model(saved.model, owner, frame), owner, what, frame, label)
 
 
-def _of_checkpoint(path: Path) -> Source:
+def _open_checkpoint(path: Path) -> Source:
     """Read a checkpoint without its run: the population is that of its recipe, which an extension may own."""
     from minisplat_ref.app.runs.settings import return_model
     from minisplat_ref.io.checkpoint import load_checkpoint
@@ -100,7 +100,7 @@ def _of_checkpoint(path: Path) -> Source:
     owner = CORE if fields == set(Gaussians._fields) else owner_of(recorded_recipe(metadata)[0]) or CORE
     bundles = read_bundles(path, arrays, owner.representation.population)
     model, frame = Model(bundles.gaussians, bundles.shared), read_frame(path, metadata)
-    label = label_for(owner, model.shared, {})
+    label = make_label(owner, model.shared, {})
     return Source(return_model(model, owner, frame), owner, f"iteration {step}", frame, label)
 
 
@@ -177,7 +177,7 @@ def finest_within(gaussians: Gaussians, format_: Format, max_bytes: int) -> Choi
 
 
 def coarsest_within(
-    gaussians: Gaussians, format_: Format, max_drop: float, psnr_of: Callable[[Gaussians], float]
+    gaussians: Gaussians, format_: Format, max_drop: float, measure_psnr: Callable[[Gaussians], float]
 ) -> Choice:
     """Return the coarsest level that loses at most this many dB.
 
@@ -188,7 +188,7 @@ def coarsest_within(
         Levels are tried from the coarsest on, and the first that is good enough is taken.
     max_drop : float
         dB.
-    psnr_of : callable
+    measure_psnr : callable
         The PSNR, dB, of Gaussians on the views that count.
 
     Raises
@@ -196,11 +196,11 @@ def coarsest_within(
     InputError
         None is good enough.
     """
-    before = psnr_of(gaussians)
+    before = measure_psnr(gaussians)
     drop = 0.0
     for level in reversed(range(len(format_.levels))):
         content = format_.encode(gaussians, level)
-        drop = before - psnr_of(format_.decode(content, format_.suffix))
+        drop = before - measure_psnr(format_.decode(content, format_.suffix))
         if drop <= max_drop + NO_DROP:
             return Choice(level, content, drop)
     raise InputError(
@@ -212,12 +212,12 @@ def coarsest_within(
 class Judge(NamedTuple):
     """Measures Gaussians on photographs."""
 
-    psnr_of: Callable[[Gaussians], float]
+    measure_psnr: Callable[[Gaussians], float]
     views: str
     """A description in a few words."""
 
 
-def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | None) -> Judge:
+def make_judge(source: Source, path: Path, scene: Path | None, downscale: int | None) -> Judge:
     """Return a function that measures a model on training views: of its run, or of a scene.
 
     Parameters
@@ -267,7 +267,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     rows = np.unique(np.linspace(0, n - 1, min(n, VIEWS_MAX)).round().astype(int))
     views = [photographs.train_views[row] for row in rows]
 
-    def psnr_of(gaussians: Gaussians) -> float:
+    def measure_psnr(gaussians: Gaussians) -> float:
         psnr = evaluate(
             place_model(source.model._replace(gaussians=gaussians), source.owner, source.frame),
             views,
@@ -278,4 +278,4 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
         assert psnr is not None
         return psnr
 
-    return Judge(psnr_of, f"{len(views)} of {n} training views of {photographs.name}")
+    return Judge(measure_psnr, f"{len(views)} of {n} training views of {photographs.name}")

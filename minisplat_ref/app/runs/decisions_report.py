@@ -63,7 +63,7 @@ def story(pace: Pace, n_iterations: int) -> str:
         rises = [
             f"from {part[0].psnr:.2f} dB after {part[0].step:,} iterations to {part[-1].psnr:.2f} dB after"
             f" {part[-1].step:,}"
-            for part in _of_one_size(pace)
+            for part in _group_by_size(pace)
         ]
         sentences.append(
             f"{len(pace.measurements[0].psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}:"
@@ -81,7 +81,7 @@ def story(pace: Pace, n_iterations: int) -> str:
     return " ".join(sentences)
 
 
-def _of_one_size(pace: Pace) -> list[tuple[Measurement, ...]]:
+def _group_by_size(pace: Pace) -> list[tuple[Measurement, ...]]:
     """Return the measurements of views of each size; those of one size cannot be compared with those of another."""
     steps = [decision.step for decision in pace.decisions if decision.what == FINER]
     parts = (
@@ -103,7 +103,7 @@ def _row(decision: Decision) -> list[str]:
 def over_iterations(pace: Pace) -> Figure:
     """Plot the PSNR of the held-out views over the iterations, with the decisions."""
     with plot(PSNR, "iterations", (5.6, 3.6)) as (figure, axes):
-        for part in _of_one_size(pace):
+        for part in _group_by_size(pace):
             _draw(axes, part, [float(m.step) for m in part])
         for decision in pace.decisions:
             axes.axvline(decision.step, color=GREY, linestyle="--", linewidth=1)
@@ -136,7 +136,7 @@ def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
 def over_work(pace: Pace) -> Figure:
     """Plot the same over the work; the gain is counted for each doubling of it."""
     with plot(PSNR, "work (pairs of tile and Gaussian)", (5.6, 3.6)) as (figure, axes):
-        for part in _of_one_size(pace):
+        for part in _group_by_size(pace):
             _draw(axes, part, [float(m.n_pairs) for m in part])
         axes.set_xscale("log", base=2)
         for decision in pace.decisions:
@@ -156,7 +156,7 @@ def _draw(axes: Axes, measurements: tuple[Measurement, ...], xs: list[float]) ->
 
 
 def _draw_slope(axes: Axes, recent: list[Measurement], gain: float) -> None:
-    """Draw the line through measurements of which ``gain`` dB for each doubling of the work is the slope."""
+    """Plot the line through measurements whose slope is ``gain`` dB for each doubling of the work."""
     doublings = np.log2([m.n_pairs for m in recent])
     middle = np.mean([m.psnr for m in recent])
     axes.plot(2**doublings, middle + gain * (doublings - doublings.mean()), color=RED, linewidth=2, zorder=3)

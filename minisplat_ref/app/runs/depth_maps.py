@@ -38,14 +38,14 @@ def depth_map(trained: Trained, view: View, kind: DepthKind) -> DepthMap:
     wants = frozenset({WANTS[kind]})
     try:
         output = trained.render(view, wants)
-        depth = _depth_of(trained, output, kind)
+        depth = _select_depth(trained, output, kind)
     except InputError as error:
         raise InputError(f"renderer {trained.renderer.name} gives no {kind.value} depth: {error}") from None
     shown = np.where((output.alpha >= ALPHA_MIN) & np.isfinite(depth), depth, 0.0)
     return DepthMap(shown.astype(np.float64), np.clip(output.image[..., :3], 0, 1).astype(np.float64))
 
 
-def _depth_of(trained: Trained, output: RenderOutput, kind: DepthKind) -> Floats:
+def _select_depth(trained: Trained, output: RenderOutput, kind: DepthKind) -> Floats:
     depth: Floats | None = None
     if kind is DepthKind.MEDIAN:
         depth = output.median_depth

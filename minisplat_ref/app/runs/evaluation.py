@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from minisplat_ref.app.runs import fingerprint, run_folder
 from minisplat_ref.app.runs.checkpoints import Saved, newest_model
 from minisplat_ref.app.runs.first_use import warn_if_not_kept
-from minisplat_ref.app.runs.model_file import choose_owner, label_of, read_population
+from minisplat_ref.app.runs.model_file import choose_owner, find_label, read_population
 from minisplat_ref.app.runs.notices import warn_of_model
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.scoring import choose_render_settings, score, to_metrics
@@ -69,7 +69,7 @@ def evaluate_run(
         The scene is not the run's and ``out`` is not given, there is nothing to measure, or a file is damaged.
     """
     settings = load(folder)
-    asked = replace(
+    requested = replace(
         settings,
         scene=str(scene or settings.scene),
         test_every=settings.test_every if test_every is None else test_every,
@@ -79,38 +79,38 @@ def evaluate_run(
     saved, frame = newest_model(folder, settings), load_frame(folder)
     if model is not None:
         owner = find_owner(settings)
-        choose_owner(model, label_of(model), owner, f"run {folder}")
+        choose_owner(model, find_label(model), owner, f"run {folder}")
         given = place_model(Model(read_population(model, owner)), owner, frame)
         saved = Saved(saved.model._replace(gaussians=given.gaussians), None)
     warn_of_model(saved.model, folder)
     warn_if_not_kept(settings.backend)
-    photographs = load_photographs(asked, frame)
+    photographs = load_photographs(requested, frame)
     if not photographs.test_views:
-        raise InputError(f"{asked.scene} has no test views: give --test-every above 0")
-    network = load_lpips(asked, photographs)
+        raise InputError(f"{requested.scene} has no test views: give --test-every above 0")
+    network = load_lpips(requested, photographs)
     entries = fingerprint.read(folder)
     fingerprint.warn_of_unchecked(folder, entries)
     notes = []
     parts = [] if saved.unfinished is None else [f"iteration-{saved.unfinished}"]
     parts += [] if model is None else [model.name]
     if entries is not None:
-        others = fingerprint.of_scene(photographs)
+        others = fingerprint.take_fingerprint(photographs)
         if differs := fingerprint.difference(entries, others):
             if out is None:
                 raise InputError(
-                    f"{asked.scene} is not the scene of {folder}: {differs}; --scene PATH says where that is now,"
+                    f"{requested.scene} is not the scene of {folder}: {differs}; --scene PATH says where that is now,"
                     " --out DIR measures on this one all the same"
                 )
             notes.append(f"not the scene that it was trained on: {differs}")
         if not fingerprint.is_split_alike(entries, others):
-            parts.append(f"test-every-{asked.test_every}")
+            parts.append(f"test-every-{requested.test_every}")
         notes += _describe_training_views(entries, photographs)
     render_settings = choose_render_settings(settings, saved.model, photographs.background)
     target = out or (folder / "-".join(["eval", *parts]) if parts else folder)
     if target == folder:
         with run_folder.hold_folder(folder):
             evaluation = score(folder, photographs.test_views, saved.model, render_settings, network)
-            metrics = _metrics_of(folder) | to_metrics(evaluation)
+            metrics = _read_metrics(folder) | to_metrics(evaluation)
             run_folder.write_json(
                 folder / run_folder.METRICS, metrics | {"n_gaussians": len(saved.model.gaussians.means)}
             )
@@ -118,7 +118,7 @@ def evaluate_run(
     _check_target(target)
     run_folder.create(target)
     evaluation = score(target, photographs.test_views, saved.model, render_settings, network)
-    about = _about(folder, asked, saved.unfinished, notes)
+    about = _about(folder, requested, saved.unfinished, notes)
     about |= {} if model is None else {"model": str(model.resolve())}
     run_folder.write_json(
         target / run_folder.METRICS,
@@ -127,18 +127,18 @@ def evaluate_run(
     return Measured(evaluation, target, notes)
 
 
-def _metrics_of(folder: Path) -> dict[str, Any]:
+def _read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / run_folder.METRICS
     return run_folder.read_json_object(path) if path.exists() else {}
 
 
-def _about(folder: Path, asked: Settings, unfinished: int | None, notes: list[str]) -> dict[str, Any]:
+def _about(folder: Path, requested: Settings, unfinished: int | None, notes: list[str]) -> dict[str, Any]:
     """Describe the measured views, for metrics in a separate folder."""
-    iterations = _metrics_of(folder).get("iterations") if unfinished is None else unfinished
+    iterations = _read_metrics(folder).get("iterations") if unfinished is None else unfinished
     return {
         "run": str(folder.resolve()),
-        "scene": str(Path(asked.scene).resolve()),
-        "test_every": asked.test_every,
+        "scene": str(Path(requested.scene).resolve()),
+        "test_every": requested.test_every,
         "iterations": iterations,
         "notes": notes,
     }
@@ -146,7 +146,7 @@ def _about(folder: Path, asked: Settings, unfinished: int | None, notes: list[st
 
 def _describe_training_views(entries: fingerprint.Entries, scene: Scene) -> list[str]:
     """Report how many of the measured views the run was trained on."""
-    names = fingerprint.trained_on(entries)
+    names = fingerprint.list_trained(entries)
     n_known = sum(view.name in names for view in scene.test_views)
     if not n_known:
         return []

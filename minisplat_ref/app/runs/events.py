@@ -1,8 +1,8 @@
 """The events of a training: ``events.jsonl`` records which mechanisms of the recipe fired, and when.
 
 A mechanism is an action that the recipe has at some iterations, not at every one: densification, pruning, a reset. In
-short or small runs some never act. A run says nothing about a mechanism that never acted in it, so such mechanisms are
-named.
+short or small runs some never act. A run is no evidence about a mechanism that never acted in it, so such mechanisms
+are named.
 """
 
 from collections import Counter

@@ -33,7 +33,7 @@ N_NAMED = 3  # views that are called by name
 Entries = Sequence[Mapping[str, Any]]
 
 
-def of_scene(scene: Scene) -> list[dict[str, Any]]:
+def take_fingerprint(scene: Scene) -> list[dict[str, Any]]:
     """Return the content of ``cameras.json``: every view with its camera, as in the files, and a photograph's hash."""
     views = (*scene.train_views, *scene.test_views)
     found = viewpoints.scene_viewpoints(scene)
@@ -86,7 +86,7 @@ def difference(entries: Entries, others: Entries) -> str:
     Parameters
     ----------
     entries, others : sequence of mappings
-        From :func:`read` and :func:`of_scene`.
+        From :func:`read` and :func:`take_fingerprint`.
     """
     ours, theirs = ({entry["img_name"]: entry for entry in them} for them in (entries, others))
     common = [name for name in ours if name in theirs]
@@ -138,7 +138,7 @@ def is_split_alike(entries: Entries, others: Entries) -> bool:
     return splits[0] == splits[1]
 
 
-def trained_on(entries: Entries) -> set[str]:
+def list_trained(entries: Entries) -> set[str]:
     """Return the names of the views that a run was trained on."""
     return {entry["img_name"] for entry in entries if entry.get("split") == "train"}
 
@@ -173,7 +173,7 @@ def check(folder: Path, scene: Scene, source: str) -> None:
     """
     entries = read(folder)
     if entries is not None:
-        others = of_scene(scene)
+        others = take_fingerprint(scene)
         differs = difference(entries, others) or ("" if is_split_alike(entries, others) else "other views are held out")
         if differs:
             raise InputError(f"{source} is not the scene of {folder}: {differs}; --scene PATH says where that is now")

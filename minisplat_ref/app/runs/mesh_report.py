@@ -6,7 +6,7 @@ import numpy as np
 
 from minisplat_ref.app.reports.images import Image8, to_8_bits
 from minisplat_ref.app.reports.page import add_caption, page, panel, section, table
-from minisplat_ref.app.runs.meshing import Asked, Meshed, Opened
+from minisplat_ref.app.runs.meshing import Meshed, MeshOptions, Opened
 from minisplat_ref.io.frames import place_points
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
 from minisplat_ref.mechanisms.peeling.kernels import peel
@@ -28,39 +28,39 @@ def vertex_normals(mesh: ColoredMesh) -> Floats:
     return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
-def draw(mesh: ColoredMesh, colors: Floats, camera: Camera) -> Image8:
-    """Draw a mesh with a colour at each vertex, opaque, on white."""
+def render_mesh(mesh: ColoredMesh, colors: Floats, camera: Camera) -> Image8:
+    """Render a mesh with a colour at each vertex, opaque, on white."""
     opaque = TranslucentMesh(mesh.vertices, np.column_stack([colors, np.ones(len(colors))]), mesh.faces)
     distance = float(np.linalg.norm(mesh.vertices.mean(axis=0) - camera.center))
     return to_8_bits(peel(opaque, Frame(camera, NEAR * distance, 1), WHITE).image)
 
 
-def report_html(opened: Opened, asked: Asked, meshed: Meshed, name: Path) -> str:
+def report_html(opened: Opened, options: MeshOptions, meshed: Meshed, name: Path) -> str:
     """Return the page."""
     mesh = meshed.mesh._replace(vertices=place_points(meshed.mesh.vertices, opened.frame))
     normals = 0.5 + 0.5 * vertex_normals(mesh)
     sides = opened.views[:: -(-len(opened.views) // N_SIDES)]
     panels = []
     for view in sides:
-        camera = opened.camera_of(view)
+        camera = opened.adapt_camera(view)
         splats = to_8_bits(opened.trained.render(view_from(view.camera, time=view.time)).image[..., :3])
         images = {
             "as the run shows it": splats,
-            "the mesh": draw(mesh, mesh.colors, camera),
-            "its normals as colours": draw(mesh, normals, camera),
+            "the mesh": render_mesh(mesh, mesh.colors, camera),
+            "its normals as colours": render_mesh(mesh, normals, camera),
         }
         panels.append(panel(view.name, [add_caption(image, caption) for caption, image in images.items()]))
     size = " x ".join(f"{length:.4g}" for length in np.ptp(meshed.mesh.vertices, axis=0))
     facts = [
-        ("run", str(asked.run)),
+        ("run", str(options.run)),
         ("triangles, vertices", f"{len(mesh.faces):,}, {len(mesh.vertices):,}"),
         ("in smaller parts, left out", f"{meshed.n_left_out:,} triangles"),
         ("voxel", f"{meshed.voxel:.4g} in the unit of the scene"),
-        ("grid", " x ".join(map(str, meshed.shape)) + (" in contracted space" if asked.is_unbounded else "")),
+        ("grid", " x ".join(map(str, meshed.shape)) + (" in contracted space" if options.is_unbounded else "")),
         ("size", size),
-        ("depth", f"{asked.depth.value}, of {meshed.n_views} views"),
+        ("depth", f"{options.depth.value}, of {meshed.n_views} views"),
     ]
     introduction = "Normals are shown as colours: red is world x, green y, blue z, each from -1 (dark) to 1 (bright)."
     return page(
-        f"{name.name}: a mesh of {asked.run.name}", introduction, [table(facts), section("From four sides", *panels)]
+        f"{name.name}: a mesh of {options.run.name}", introduction, [table(facts), section("From four sides", *panels)]
     )

@@ -33,7 +33,7 @@ MARGIN = 2 * TRUNCATION  # voxels around the box
 POINTS_PER_VIEW = 4_000  # in the first pass
 
 
-class Asked(NamedTuple):
+class MeshOptions(NamedTuple):
     """The options of the command line."""
 
     run: Path
@@ -66,11 +66,11 @@ class Opened(NamedTuple):
     views: list[Viewpoint]
     frame: Frame
 
-    def map_of(self, view: Viewpoint, kind: DepthKind) -> DepthMap:
+    def render_map(self, view: Viewpoint, kind: DepthKind) -> DepthMap:
         """Return the image and the depth map of a camera."""
         return depth_map(self.trained, view_from(view.camera, time=view.time), kind)
 
-    def camera_of(self, view: Viewpoint) -> Camera:
+    def adapt_camera(self, view: Viewpoint) -> Camera:
         """Return the camera as the run's conventions see it."""
         return with_principal_point(view.camera, PROFILES[self.trained.profile])
 
@@ -89,7 +89,7 @@ def open_for_mesh(folder: Path) -> Opened:
     return Opened(trained, [view._replace(camera=place_camera(view.camera, frame)) for view in views], frame)
 
 
-def mesh_run(opened: Opened, asked: Asked) -> Meshed:
+def mesh_run(opened: Opened, options: MeshOptions) -> Meshed:
     """Return the surface of a run.
 
     Raises
@@ -100,19 +100,21 @@ def mesh_run(opened: Opened, asked: Asked) -> Meshed:
     """
     marching_cubes_package()
     unit = opened.frame.unit
-    places = _find_surface(opened, asked.depth)
+    places = _find_surface(opened, options.depth)
     if len(places.points) == 0:
-        raise InputError(f"{asked.run}: no training view shows a surface that hides half of what is behind: train more")
-    grid = _choose_grid(opened, places, asked)
+        raise InputError(
+            f"{options.run}: no training view shows a surface that hides half of what is behind: train more"
+        )
+    grid = _choose_grid(opened, places, options)
     volume = empty_volume(grid)
     truncation = TRUNCATION * grid.voxel * (1.0 if grid.contraction is None else grid.contraction.radius)
     for view in with_progress(opened.views, "fusing depths", "views"):
-        fuse(volume, grid, opened.camera_of(view), opened.map_of(view, asked.depth), truncation)
+        fuse(volume, grid, opened.adapt_camera(view), opened.render_map(view, options.depth), truncation)
     try:
-        whole = extract(volume, grid, asked.min_views)
+        whole = extract(volume, grid, options.min_views)
     except InputError as error:
-        raise InputError(f"{asked.run}: {error}; lower --min-views or give a larger --voxel") from None
-    mesh = keep_largest(whole, asked.n_parts)
+        raise InputError(f"{options.run}: {error}; lower --min-views or give a larger --voxel") from None
+    mesh = keep_largest(whole, options.n_parts)
     voxel = truncation / TRUNCATION * unit
     vertices = np.array(opened.frame.origin) + unit * mesh.vertices
     n_left_out = len(whole.faces) - len(mesh.faces)
@@ -132,7 +134,7 @@ def _find_surface(opened: Opened, kind: DepthKind) -> _Places:
     points: list[Floats] = [np.zeros((0, 3))]
     footprints: list[Floats] = [np.zeros(0)]
     for view in with_progress(opened.views, "looking for the surface", "views"):
-        depth, camera = opened.map_of(view, kind).depth, opened.camera_of(view)
+        depth, camera = opened.render_map(view, kind).depth, opened.adapt_camera(view)
         ids = np.flatnonzero(depth > 0)
         ids = ids[:: max(1, -(-len(ids) // POINTS_PER_VIEW))]
         z = depth.ravel()[ids]
@@ -142,14 +144,14 @@ def _find_surface(opened: Opened, kind: DepthKind) -> _Places:
     return _Places(np.concatenate(points), np.concatenate(footprints))
 
 
-def _choose_grid(opened: Opened, places: _Places, asked: Asked) -> Grid:
+def _choose_grid(opened: Opened, places: _Places, options: MeshOptions) -> Grid:
     """Return the grid: voxels as large as the pixels of the surface, or as many as ``N_VOXELS_MAX``.
 
     Without bounds, the space nearer to the point that the cameras face than the nearest camera is not contracted.
     """
     footprint = float(np.median(places.footprints))
-    given = None if asked.voxel is None else asked.voxel / opened.frame.unit
-    if asked.is_unbounded:
+    given = None if options.voxel is None else options.voxel / opened.frame.unit
+    if options.is_unbounded:
         cameras = [view.camera for view in opened.views]
         centers = np.array([camera.center for camera in cameras])
         focus = nearest_to_axes(centers, np.array([camera.cam_from_world_R[2] for camera in cameras]))

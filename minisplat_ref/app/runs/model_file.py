@@ -40,13 +40,13 @@ def describe_parts(names: Iterable[str]) -> str:
     return " and ".join(PARTS.get(name, name) for name in names)
 
 
-def label_for(owner: Extension, shared: Iterable[str], settings: Mapping[str, str]) -> Label:
+def make_label(owner: Extension, shared: Iterable[str], settings: Mapping[str, str]) -> Label:
     """Return the label for a file with the population of a run.
 
     Parameters
     ----------
     owner : Extension
-        Whose population it is.
+        The owner of the population.
     shared : iterable of str
         Names of the shared parameters of the run, which the file does not hold.
     settings : mapping of str to str
@@ -56,7 +56,7 @@ def label_for(owner: Extension, shared: Iterable[str], settings: Mapping[str, st
     return owner.label._replace(lacks=missing_parts(shared), set=settings_of_renderer)
 
 
-def label_of(path: Path) -> Label:
+def find_label(path: Path) -> Label:
     """Return the label of a PLY or a compact file.
 
     Raises
@@ -131,7 +131,7 @@ def read_population(path: Path, owner: Extension) -> Any:
     path : Path
         A file with an unknown suffix is read as a PLY.
     owner : Extension
-        Whose population it is, for a PLY; ``CORE`` for the six fields.
+        The owner of the population, for a PLY; ``CORE`` for the six fields.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def read_model(path: Path, extension: str | None = None) -> ModelFile:
     InputError
         The file is damaged or missing, its extension is not installed, or an array is missing that the extension needs.
     """
-    label = label_of(path)
+    label = find_label(path)
     given = None
     if extension is not None:
         given = CORE if extension == CORE.name else load_extension(extension)

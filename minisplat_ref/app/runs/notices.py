@@ -58,7 +58,7 @@ def report_inventory(path: Path, scene: Scene, model: str | None) -> None:
 
 
 def describe_place(scene: Scene) -> str:
-    """Say that a scene is trained in another frame than that of its files; nothing where it is not."""
+    """Return a sentence about the frame of a scene, empty where it is that of its files."""
     if scene.frame == FILE_FRAME:
         return ""
     extent = scene.frame.unit * scene.extent

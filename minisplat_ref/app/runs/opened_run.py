@@ -8,7 +8,7 @@ from typing import NamedTuple
 from minisplat_ref.app.runs import fingerprint, run_folder
 from minisplat_ref.app.runs.checkpoints import newest_model
 from minisplat_ref.app.runs.options import Settings
-from minisplat_ref.app.runs.settings import find_owner, load, load_frame, load_photographs, recipe_of
+from minisplat_ref.app.runs.settings import configure_recipe, find_owner, load, load_frame, load_photographs
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.extension import Extension
@@ -31,7 +31,7 @@ class Run(NamedTuple):
     recipe: Recipe
     """With the calibrations that the model has parameters of."""
     owner: Extension
-    """Whose population it is."""
+    """The owner of the population."""
     scene: Scene
     """Training views numbered."""
     model: Model
@@ -93,7 +93,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     check_views(photographs, "simplify")
     if n_rows(saved.model.gaussians) < 2:
         raise InputError(f"{folder} holds {n_rows(saved.model.gaussians)} Gaussians, of which none can go: train more")
-    recipe = recipe_of(settings)
+    recipe = configure_recipe(settings)
     run = Run(
         folder,
         settings,

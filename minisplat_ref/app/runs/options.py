@@ -32,14 +32,14 @@ HIDDEN = argparse.SUPPRESS  # the help of an option that --help does not list
 
 @dataclass(frozen=True)
 class Option:
-    """What ``train`` says and takes of a setting."""
+    """The option of ``train`` that gives a setting."""
 
     help: str
     """Its line of ``--help``, in which ``{default}`` stands for the default; or HIDDEN."""
     metavar: str | None = None
-    """How the line calls its value; None for one that takes none."""
+    """Name of its value in the line; None for one that takes none."""
     parse: Callable[[str], Any] = str
-    """Makes of the word what ``config.json`` is to hold; of an option that is repeated, a key and its value."""
+    """Parses the word into the value in ``config.json``; for an option that is repeated, a key and its value."""
     choices: tuple[str, ...] | None = None
     """All values that there are; None where there are too many."""
     is_valid: Callable[[Any], bool] = lambda value: True
@@ -144,13 +144,13 @@ class Settings:
     """Offset of the first held-out photograph, below ``test_every``: one fold of a cross-validation."""
 
 
-def options_of(declaration: type) -> dict[str, Option]:
+def list_options(declaration: type) -> dict[str, Option]:
     """Return the options of a declaration such as :class:`Settings`, by the names of its fields.
 
     Raises
     ------
     TypeError
-        A field says neither how it is given on the command line nor that it cannot be, or its option has no help.
+        A field has neither an option nor NO_OPTION, or its option has no help.
     """
     options = {}
     for setting in fields(declaration):
@@ -163,7 +163,7 @@ def options_of(declaration: type) -> dict[str, Option]:
     return options
 
 
-OPTIONS = options_of(Settings)
+OPTIONS = list_options(Settings)
 """The options of ``train`` that become settings."""
 _FIELDS = {setting.name: setting for setting in fields(Settings)}
 NAMES = tuple(_FIELDS)
@@ -171,7 +171,7 @@ FIRST_NAMES = NAMES[: NAMES.index("backend") + 1]  # which runs of every version
 NEW_ON_RESUME = tuple(name for name, option in OPTIONS.items() if option.on_resume)
 
 
-def _types_of(name: str) -> tuple[type, ...]:
+def _list_types(name: str) -> tuple[type, ...]:
     """Return the types that a setting can have."""
     kind = get_args(_FIELDS[name].type)[0]
     return tuple(get_origin(part) or part for part in (get_args(kind) if isinstance(kind, UnionType) else (kind,)))
@@ -180,7 +180,7 @@ def _types_of(name: str) -> tuple[type, ...]:
 def add_settings(parser: argparse._ActionsContainer, *names: str, **helps: str) -> None:
     """Add the options of these settings, or with another help, to a parser that leaves out what is not given."""
     for name, text in ({name: OPTIONS[name].help for name in names} | helps).items():
-        option, types = OPTIONS[name], _types_of(name)
+        option, types = OPTIONS[name], _list_types(name)
         words: dict[str, Any] = {"type": option.parse, "choices": option.choices, "metavar": option.metavar}
         if bool in types:
             words = {"action": "store_true"}
@@ -193,7 +193,7 @@ def first_wrong(settings: Settings) -> str | None:
     """Return the name of the first setting whose value no training can have; None where all are right."""
     for name in NAMES:
         value, option = getattr(settings, name), OPTIONS.get(name)
-        if not isinstance(value, _types_of(name)):
+        if not isinstance(value, _list_types(name)):
             return name
         if option and value is not None and not (option.is_valid(value) and value in (option.choices or (value,))):
             return name

@@ -11,14 +11,14 @@ from minisplat_ref.app.runs.run import Training
 from minisplat_ref.app.runs.scene_part import read_region
 from minisplat_ref.app.runs.settings import (
     check_frame,
+    configure_recipe,
     find_owner,
     load_frame,
     load_lpips,
     load_photographs,
-    recipe_of,
 )
 from minisplat_ref.app.runs.simplification import Target, check_before_training
-from minisplat_ref.app.runs.start import start_from
+from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.errors import InputError
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
@@ -36,7 +36,7 @@ def prepare(folder: Path, settings: Settings) -> Training:
         There is no such recipe, it does not go with a setting, or the scene, its photographs, the weights of LPIPS or
         the start cannot be used.
     """
-    recipe = recipe_of(settings)
+    recipe = configure_recipe(settings)
     _check_minutes(settings.minutes, recipe)
     scene = load_photographs(settings)
     check_frame(settings, scene)
@@ -54,7 +54,7 @@ def prepare_continued(folder: Path, settings: Settings, state: TrainState | None
     InputError
         As for :func:`prepare`, or the scene is not the one that the run was trained on.
     """
-    recipe = recipe_of(settings)
+    recipe = configure_recipe(settings)
     scene = load_photographs(settings, load_frame(folder))
     fingerprint.check(folder, scene, settings.scene)
     network = load_lpips(settings, scene)
@@ -74,7 +74,7 @@ def _check_minutes(minutes: float | None, recipe: Recipe) -> None:
 
 def _first_state(settings: Settings, scene: Scene, recipe: Recipe) -> TrainState:
     """Return the state before the first iteration, from the scene's points or from what --init gives."""
-    start = start_from(settings.init, scene, recipe, settings.seed)
+    start = make_start(settings.init, scene, recipe, settings.seed)
     for notice in start.notices:
         print(f"minisplat-ref: {notice}", file=sys.stderr)
     if start.source is not None:

@@ -1,4 +1,4 @@
-"""Runs a training into its folder: progress, checkpoints, and everything that the folder holds in the end.
+"""Run a training in its folder: progress, checkpoints, and everything that the folder holds in the end.
 
 Nothing that has taken time is ever deleted. The first checkpoint is written before the first iteration; Ctrl-C,
 SIGTERM, a full disk, a number that is not finite or an error of the program end the training with the last whole state
@@ -54,14 +54,14 @@ class Outcome(NamedTuple):
 
 
 class Training(NamedTuple):
-    """A training and all that it takes."""
+    """A training with everything that it needs."""
 
     folder: Path
     """The run; exists, and no other process writes there."""
     scene: Scene
     """The loaded scene."""
     settings: Settings
-    """Of the run; ``iterations`` says where to stop."""
+    """Of the run; ``iterations`` is where to stop."""
     recipe: Recipe
     """The recipe of the settings, scaled to ``settings.schedule_iterations``."""
     state: TrainState
@@ -69,7 +69,7 @@ class Training(NamedTuple):
     network: Network | None = None
     """Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after."""
     check_every: int = Guard().every
-    """Iterations after which parameters and gradients are looked at for numbers that are not finite."""
+    """Iterations after which parameters and gradients are checked for numbers that are not finite."""
     watches: Sequence[Watch] = ()
     """What shows the training to a person while it runs, such as :func:`.preview.make_preview`."""
 
@@ -86,18 +86,18 @@ def run_training(training: Training) -> Outcome:
     Raises
     ------
     InputError
-        A file cannot be written, memory has no room, or a number is not finite: says what has been saved.
+        A file cannot be written, memory has no room, or a number is not finite; the message names the saved iteration.
     """
     folder, scene, settings, recipe, state = training[:5]
     with saving_on_error(folder, recipe, state):
         run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
-        run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(scene))
+        run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.take_fingerprint(scene))
         if state.step == 0:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
         total = settings.iterations if recipe.cooling is None else state.pace.last_step
         progress = Progress(folder / run_folder.LOG, state.step, total, recipe.cooling)
-        on_step = _on_step(training, progress, surface)
+        on_step = _make_callback(training, progress, surface)
         with progress:
             with contextlib.suppress(KeyboardInterrupt):
                 train(
@@ -117,14 +117,14 @@ def run_training(training: Training) -> Outcome:
 
 @contextmanager
 def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator[None]:
-    """Save the state if an error leaves it whole, and let the error say from where the run can continue."""
+    """Save the state if an error leaves it whole, and add to the error where the run can continue."""
     try:
         yield
     except Exception as error:
-        if state.is_whole and checkpoints.step_of(folder) != state.step:
-            with contextlib.suppress(InputError):  # a full disk, perhaps, which is what the error says already
+        if state.is_whole and checkpoints.read_step(folder) != state.step:
+            with contextlib.suppress(InputError):  # a full disk, perhaps, which the error reports already
                 checkpoints.save(folder, state, recipe)
-        step = checkpoints.step_of(folder)
+        step = checkpoints.read_step(folder)
         saved = f"; iteration {step} is saved; to continue: minisplat-ref train --resume {folder}" if step else ""
         if isinstance(error, MemoryError):
             raise InputError(f"memory is full: train on smaller photographs (--downscale){saved}") from error
@@ -134,19 +134,19 @@ def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator
         raise
 
 
-def _on_step(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
+def _make_callback(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
     """Return the callback of the loop: records, measurements and checkpoints."""
     folder, scene, settings, recipe, state = training[:5]
     callbacks: list[Callable[[StepReport], None]] = [progress]
     if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
         curve.keep_until(folder / run_folder.EVENTS, state.step)
-        callbacks.append(_events(folder / run_folder.EVENTS))
+        callbacks.append(_record_events(folder / run_folder.EVENTS))
     if settings.eval_every:
         curve.keep_until(folder / run_folder.CURVE, state.step)
-        callbacks.append(_curve(training, progress, surface))
+        callbacks.append(_record_curve(training, progress, surface))
     callbacks.extend(watch(folder, scene, settings, progress) for watch in training.watches)
     if settings.minutes is not None:
-        callbacks.append(_in_time(settings, recipe, state, progress, len(scene.train_views)))
+        callbacks.append(_cool_within_minutes(settings, recipe, state, progress, len(scene.train_views)))
     callbacks.append(checkpoints.save_regularly(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
@@ -156,7 +156,7 @@ def _on_step(training: Training, progress: Progress, surface: Surface | None) ->
     return on_step
 
 
-def _in_time(
+def _cool_within_minutes(
     settings: Settings, recipe: Recipe, state: TrainState, progress: Progress, n_views: int
 ) -> Callable[[StepReport], None]:
     """Return a callback of the loop that begins the cool-down in time to end after ``settings.minutes``.
@@ -212,7 +212,7 @@ def _measure(training: Training, clock: Clock, surface: Surface | None) -> Evalu
 
     Returns None when Ctrl-C comes meanwhile.
     """
-    from minisplat_ref.app.runs.run_report import write_report  # draws curves: a training would wait for that
+    from minisplat_ref.app.runs.run_report import write_report  # imports matplotlib: a training would wait for that
 
     folder, scene, settings, _, state = training[:5]
     peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
@@ -221,7 +221,7 @@ def _measure(training: Training, clock: Clock, surface: Surface | None) -> Evalu
     try:
         evaluation = score(folder, scene.test_views, model, training.render_settings(model), training.network)
         if settings.eval_every:
-            further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(model.gaussians, surface)}
+            further = {"cpu_seconds": clock.cpu_seconds, **_measure_chamfer(model.gaussians, surface)}
             curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
         metrics = {
             "n_gaussians": n_gaussians,
@@ -239,12 +239,12 @@ def _measure(training: Training, clock: Clock, surface: Surface | None) -> Evalu
     return evaluation
 
 
-def _events(path: Path) -> Callable[[StepReport], None]:
+def _record_events(path: Path) -> Callable[[StepReport], None]:
     """Return a callback of the loop that records what fired."""
     return lambda report: events.append(path, report.step, report.fired)
 
 
-def _curve(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
+def _record_curve(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
     """Return a callback of the loop that measures the test views on the way, off the training's clock."""
     path = training.folder / run_folder.CURVE
 
@@ -254,7 +254,7 @@ def _curve(training: Training, progress: Progress, surface: Surface | None) -> C
         (seconds, cpu_seconds), model = progress.clock, report.state.model
         with progress.paused():
             evaluation = evaluate(model, training.scene.test_views, training.render_settings(model))
-            further = {"cpu_seconds": cpu_seconds, **_chamfer(model.gaussians, surface)}
+            further = {"cpu_seconds": cpu_seconds, **_measure_chamfer(model.gaussians, surface)}
             curve.append(
                 path,
                 report.step,
@@ -267,14 +267,14 @@ def _curve(training: Training, progress: Progress, surface: Surface | None) -> C
     return on_step
 
 
-def _chamfer(gaussians: Any, surface: Surface | None) -> dict[str, float | None]:
+def _measure_chamfer(gaussians: Any, surface: Surface | None) -> dict[str, float | None]:
     return {} if surface is None else {"chamfer": surface_distance(gaussians, surface)}
 
 
 def peak_rss_mb() -> float | None:
-    """Return the most memory that this process has held, MB; None on systems that do not say.
+    """Return the peak memory of this process, MB; None on systems that do not report it.
 
-    Linux hands what ``getrusage`` says down from the process that started this one, so its own count is read there.
+    On Linux ``getrusage`` inherits the peak of the parent process, so /proc is read there.
     """
     status = Path("/proc/self/status")
     if status.exists():

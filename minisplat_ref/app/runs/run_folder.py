@@ -117,7 +117,7 @@ def is_finished(folder: Path, iterations: int) -> bool:
     ----------
     folder : Path
     iterations : int
-        That it was asked for; a recipe that decides its own length may have ended before.
+        The requested ones; a recipe that decides its own length may have ended before.
     """
     if not (folder / METRICS).exists():
         return False

@@ -143,9 +143,9 @@ def read_part(path: Path, source: Path) -> Part:
     region, content = read_region(path), read_json_object(path)
     try:
         arrays = read_npz(path.with_suffix(".npz"), WAY_OUT)
-        return Part(region, listing_file.from_files(source, content, arrays), _unpack(content["masks"], arrays))
+        return Part(region, listing_file.read_listing(source, content, arrays), _unpack(content["masks"], arrays))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _of_another_version(path, error) from error
+        raise _version_error(path, error) from error
 
 
 def read_region(path: Path) -> Region:
@@ -157,10 +157,10 @@ def read_region(path: Path) -> Region:
     try:
         return Region(Plane(origin, axes), box_from_json(content["region"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise _of_another_version(path, error) from error
+        raise _version_error(path, error) from error
 
 
-def _of_another_version(path: Path, error: Exception) -> InputError:
+def _version_error(path: Path, error: Exception) -> InputError:
     return InputError(f"{path} is not a part of a scene of this version ({error}): {WAY_OUT}")
 
 

@@ -10,7 +10,7 @@ from minisplat_ref.app.reports.images import error_image, side_by_side, to_8_bit
 from minisplat_ref.app.runs.checkpoints import newest_model
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import RENDERS
-from minisplat_ref.app.runs.settings import load, load_background, recipe_of
+from minisplat_ref.app.runs.settings import configure_recipe, load, load_background
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.interface.progress import progress_bar
@@ -45,7 +45,7 @@ class Trained(NamedTuple):
 
 def choose_renderer(settings: Settings, model: Model) -> Renderer:
     """Return the renderer with which a run renders a model: with the sky that it has been given, too."""
-    return as_trained(recipe_of(settings), model).renderer
+    return as_trained(configure_recipe(settings), model).renderer
 
 
 def choose_render_settings(settings: Settings, model: Model, background: Floats) -> RenderSettings:

@@ -1,4 +1,4 @@
-"""What the settings of a run stand for: its recipe, its photographs and its model; and their file ``config.json``."""
+"""The settings of a run in their file ``config.json``, and the recipe, photographs and model that they determine."""
 
 import platform
 import reprlib
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref import __version__
-from minisplat_ref.app.runs.model_file import label_for
+from minisplat_ref.app.runs.model_file import make_label
 from minisplat_ref.app.runs.options import FIRST_NAMES, NAMES, Settings, first_wrong
 from minisplat_ref.app.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.app.runs.scene_part import read_part
@@ -48,7 +48,7 @@ SHARED_UNITS = {SHIFTS: Unit.LENGTH}  # of shared parameters of any recipe
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")  # those that are installed
 
 
-def recipe_of(settings: Settings) -> Recipe:
+def configure_recipe(settings: Settings) -> Recipe:
     """Return the recipe of a run, scaled and with what the run sets differently.
 
     Raises
@@ -93,7 +93,7 @@ def save_model(folder: Path, settings: Settings, model: Model, frame: Frame) -> 
     """
     owner = find_owner(settings)
     model = return_model(model, owner, frame)
-    owner.save(folder / POINT_CLOUD, model.gaussians, label_for(owner, model.shared, settings.set))
+    owner.save(folder / POINT_CLOUD, model.gaussians, make_label(owner, model.shared, settings.set))
     if model.shared:
         with replacing(folder / SHARED) as temporary, open(temporary, "wb") as file:
             np.savez(file, allow_pickle=False, **model.shared)
@@ -133,7 +133,7 @@ def load_model(folder: Path, settings: Settings) -> Model:
     return place_model(Model(gaussians, shared), owner, load_frame(folder))
 
 
-def _version_of(package: str) -> str | None:
+def _find_version(package: str) -> str | None:
     """Return the version of a package, None where it is not installed."""
     try:
         return version(package)
@@ -143,7 +143,7 @@ def _version_of(package: str) -> str | None:
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
     """Return what ``config.json`` holds: the settings, the recipe spelled out, and the versions that run it."""
-    versions = {package: found for package in REPORTED_PACKAGES if (found := _version_of(package)) is not None}
+    versions = {package: found for package in REPORTED_PACKAGES if (found := _find_version(package)) is not None}
     return {
         "settings": asdict(settings),
         "background": scene.background.tolist(),
@@ -164,11 +164,11 @@ def load(folder: Path) -> Settings:
     """
     path, content = folder / CONFIG, _read_config(folder).get("settings")
     if not isinstance(content, dict):
-        raise _of_another_version(path, "it has no settings")
+        raise _version_error(path, "it has no settings")
     if lacking := [name for name in FIRST_NAMES if name not in content]:
-        raise _of_another_version(path, f"it has no setting {lacking[0]}")
+        raise _version_error(path, f"it has no setting {lacking[0]}")
     if surplus := [name for name in content if name not in NAMES]:
-        raise _of_another_version(path, f"{reprlib.repr(surplus[0])} is no setting")
+        raise _version_error(path, f"{reprlib.repr(surplus[0])} is no setting")
     settings = Settings(**content)
     if wrong := first_wrong(settings):
         value = reprlib.repr(content[wrong])
@@ -176,7 +176,7 @@ def load(folder: Path) -> Settings:
     return settings
 
 
-def _of_another_version(path: Path, why: str) -> InputError:
+def _version_error(path: Path, why: str) -> InputError:
     return InputError(f"{path} is not the configuration of a training of this version: {why}")
 
 
@@ -217,7 +217,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
 
 
 def list_photographs(settings: Settings) -> Listing:
-    """Return what is known of the whole scene of a run before its photographs are read; errors as for the scene."""
+    """Return the cameras, points and files of a run's whole scene, without its pixels; errors as for the scene."""
     return list_scene(Path(settings.scene), settings.test_every, settings.model, settings.fold)
 
 
@@ -230,7 +230,7 @@ def load_photographs(settings: Settings, frame: Frame | None = None, listing: Li
     frame : Frame, optional
         That of the run; by default the one that suits the scene.
     listing : Listing, optional
-        Of the whole scene, for who needs it, too; by default it is read, or that of the part.
+        Of the whole scene; by default it is read, or that of the part.
 
     Raises
     ------
@@ -266,7 +266,7 @@ def check_frame(settings: Settings, scene: Scene) -> None:
     Raises
     ------
     InputError
-        Says how far it is.
+        Names the distance.
     """
     owner = find_owner(settings)
     if any(scene.frame.origin) and owner.save is not save_ply:
@@ -278,7 +278,7 @@ def check_frame(settings: Settings, scene: Scene) -> None:
 
 
 def load_lpips(settings: Settings, scene: Scene) -> Network | None:
-    """Read the network that a run's LPIPS is measured with, None where it has none, and see that it fits the views.
+    """Read the network that a run's LPIPS is measured with, None where it has none, and check that it fits the views.
 
     Raises
     ------

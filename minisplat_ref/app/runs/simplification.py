@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.runs.model_file import label_for
+from minisplat_ref.app.runs.model_file import make_label
 from minisplat_ref.app.runs.opened_run import Run, check_renderer, check_views
 from minisplat_ref.app.runs.rate_distortion import PlySize, Point, next_size, paired_drop, smallest_within
 from minisplat_ref.errors import InputError
@@ -103,7 +103,7 @@ def ply_size(run: Run) -> PlySize:
         for n in (1, 2):
             path = Path(folder, f"{n}.ply")
             rows, units = take(run.model.gaussians, np.arange(n)), run.owner.representation.units
-            label = label_for(run.owner, run.model.shared, run.settings.set)
+            label = make_label(run.owner, run.model.shared, run.settings.set)
             run.owner.save(path, return_population(rows, units, run.scene.frame), label)
             n_bytes.append(path.stat().st_size)
     row = n_bytes[1] - n_bytes[0]
@@ -120,10 +120,10 @@ def check_before_training(run: Run, target: Target) -> None:
     """
     check_views(run.scene, f"--{'max-drop' if target.max_bytes is None else 'max-bytes'}")
     check_renderer(run)
-    limit_of(target, ply_size(run))
+    find_limit(target, ply_size(run))
 
 
-def limit_of(target: Target, size: PlySize) -> int | None:
+def find_limit(target: Target, size: PlySize) -> int | None:
     """Return the most Gaussians that a target allows; None where the curve decides.
 
     Raises
@@ -220,7 +220,7 @@ def fine_tune(run: Run, gaussians: Any, iterations: int, *, views: Sequence[int]
 
 
 def _shuffled(views: Sequence[int], iterations: int, rng: np.random.Generator) -> list[int]:
-    """Return the views of all iterations, so that the loop, which takes the last one first, never asks for another."""
+    """Return the views of all iterations, so that the loop, which takes the last one first, never draws another."""
     n_rounds = -(-iterations // len(views))
     rounds = [rng.permutation(views) for _ in range(n_rounds)]
     return [int(view) for each in rounds for view in each][:iterations]
@@ -231,12 +231,12 @@ def blend_weights(run: Run) -> Floats:
     return indoor(collect_importance(run.model, run.scene.train_views, run.render_settings))
 
 
-def metrics_of(run: Run, model: Model, views: Sequence[View]) -> list[ViewMetrics]:
+def evaluate_views(run: Run, model: Model, views: Sequence[View]) -> list[ViewMetrics]:
     """Return the metrics of each view, with its own exposure and pose where the run has trained them."""
     return evaluate(model, views, run.render_settings).per_view
 
 
-def measuring(run: Run, iterations: int) -> Callable[[int], Point]:
+def make_measure(run: Run, iterations: int) -> Callable[[int], Point]:
     """Return the function that measures a number of Gaussians, each only once.
 
     Parameters
@@ -256,47 +256,47 @@ def measuring(run: Run, iterations: int) -> Callable[[int], Point]:
         raise InputError(f"{run.folder}: no training view sees any Gaussian: train longer, or check the cameras")
 
     @cache
-    def point_of(count: int) -> Point:
+    def measure_size(count: int) -> Point:
         measured = cross_validate(run, reduce(run, importance, count), iterations)
         psnrs, ssims = tuple(view.psnr for view in measured), tuple(view.ssim for view in measured)
-        before = psnrs if count == n else point_of(n).psnrs
+        before = psnrs if count == n else measure_size(n).psnrs
         return Point(count, size.of(count), psnrs, ssims, *paired_drop(before, psnrs))
 
-    return point_of
+    return measure_size
 
 
-def decide(run: Run, target: Target, point_of: Callable[[int], Point]) -> Decision:
+def decide(run: Run, target: Target, measure_size: Callable[[int], Point]) -> Decision:
     """Measure sizes until the target is met, and choose one.
 
     Parameters
     ----------
     run : Run
     target : Target
-    point_of : callable
-        See :func:`measuring`.
+    measure_size : callable
+        See :func:`make_measure`.
 
     Raises
     ------
     InputError
         Not even one Gaussian fits.
     """
-    limit = limit_of(target, ply_size(run))
+    limit = find_limit(target, ply_size(run))
     n, n_candidates = n_rows(run.model.gaussians), int(np.count_nonzero(blend_weights(run)))
-    reference = point_of(n)
+    reference = measure_size(n)
     points: list[Point] = []
     chosen: Point | None = None
     if target.limit is not None:
         while (count := next_size(points, n, n_candidates, target.limit)) is not None:
-            points.append(point_of(count))
+            points.append(measure_size(count))
         chosen = smallest_within(points, target.limit)
     elif limit is not None and min(limit, n_candidates) < n:
-        chosen = point_of(min(limit, n_candidates))
+        chosen = measure_size(min(limit, n_candidates))
         points.append(chosen)
     return Decision(
         reference,
         tuple(sorted(points, key=lambda point: point.n_gaussians)),
         reference if chosen is None else chosen,
-        float(np.mean([view.psnr for view in metrics_of(run, run.model, run.scene.train_views)])),
+        float(np.mean([view.psnr for view in evaluate_views(run, run.model, run.scene.train_views)])),
         limit is not None and limit > n_candidates,
     )
 
@@ -309,7 +309,7 @@ def cross_validate(run: Run, gaussians: Any, iterations: int) -> list[ViewMetric
         for fold in run.folds:
             copy = take(gaussians, every_row)
             model = fine_tune(run, copy, iterations, views=fold.trained, on_step=bar.update)
-            held_out = metrics_of(run, model, [views[k] for k in fold.held_out])
+            held_out = evaluate_views(run, model, [views[k] for k in fold.held_out])
             measured.update(zip(fold.held_out, held_out, strict=True))
     return [measured[k] for k in range(len(views))]
 

@@ -62,7 +62,7 @@ def describe_decision(result: dict[str, Any]) -> str:
     held_out = f"on {n_views} training views, each held out in turn"
     if not result["is_unchanged"]:
         ssim = result["all"]["ssim"] - chosen["ssim"]
-        lost = f"lose {_with_error(chosen)} dB of PSNR and {ssim:.4f} of SSIM"
+        lost = f"lose {_format_drop(chosen)} dB of PSNR and {ssim:.4f} of SSIM"
         return f"{chosen['n_gaussians']:,} of {result['all']['n_gaussians']:,} Gaussians {lost} {held_out}"
     if result["max_drop"] is None:
         return f"already as small: {result['target']} allows all {chosen['n_gaussians']:,} Gaussians of the run"
@@ -71,7 +71,7 @@ def describe_decision(result: dict[str, Any]) -> str:
     nearest = min(result["curve"], key=lambda point: point["drop"] + point["standard_error"])
     return (
         f"already as small as it gets: {nearest['n_gaussians']:,} instead of {chosen['n_gaussians']:,} Gaussians lose"
-        f" {_with_error(nearest)} dB {held_out}; the two together are more than {result['max_drop']:g} dB"
+        f" {_format_drop(nearest)} dB {held_out}; the two together are more than {result['max_drop']:g} dB"
     )
 
 
@@ -88,30 +88,30 @@ def describe_outcome(result: dict[str, Any]) -> str:
         return f"test PSNR {test['psnr_after']:.2f} dB, as before ({views}), {counts}"
     return (
         f"test PSNR {test['psnr_before']:.2f} -> {test['psnr_after']:.2f} dB ({views}), a drop of"
-        f" {_with_error(test)} dB, {counts}"
+        f" {_format_drop(test)} dB, {counts}"
     )
 
 
-def _with_error(drop: dict[str, Any]) -> str:
+def _format_drop(drop: dict[str, Any]) -> str:
     error = drop["standard_error"]
     return f"{drop['drop']:.3f}" if error is None else f"{drop['drop']:.3f} ± {error:.3f}"
 
 
-def draw(result: dict[str, Any]) -> Figure:
+def plot(result: dict[str, Any]) -> Figure:
     """Plot PSNR and drop against the number of Gaussians, with the chosen size."""
-    return _figure(result, _draw_psnr, _draw_drop)
+    return _figure(result, _plot_psnr, _plot_drop)
 
 
-def _figure(result: dict[str, Any], *draws: Callable[[Axes, dict[str, Any]], None]) -> Figure:
+def _figure(result: dict[str, Any], *plots: Callable[[Axes, dict[str, Any]], None]) -> Figure:
     """Plot side by side."""
     with rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(5.2 * len(draws), 3.9), layout="constrained")
-        for axes, draw_on in zip(figure.subplots(1, len(draws), squeeze=False)[0], draws, strict=True):
-            draw_on(axes, result)
+        figure = Figure(figsize=(5.2 * len(plots), 3.9), layout="constrained")
+        for axes, plot_on in zip(figure.subplots(1, len(plots), squeeze=False)[0], plots, strict=True):
+            plot_on(axes, result)
     return figure
 
 
-def _draw_psnr(axes: Axes, result: dict[str, Any]) -> None:
+def _plot_psnr(axes: Axes, result: dict[str, Any]) -> None:
     points = [*result["curve"], result["all"]]
     counts, psnrs = ([point[name] for point in points] for name in ("n_gaussians", "psnr"))
     axes.plot(counts, psnrs, color=BLUE, marker="o", ms=4, label="fine-tuned")
@@ -121,7 +121,7 @@ def _draw_psnr(axes: Axes, result: dict[str, Any]) -> None:
     axes.legend(frameon=False, fontsize=9, loc="lower right")
 
 
-def _draw_drop(axes: Axes, result: dict[str, Any]) -> None:
+def _plot_drop(axes: Axes, result: dict[str, Any]) -> None:
     points, limit = [*result["curve"], result["all"]], result["max_drop"]
     counts, drops, errors = ([p[name] for p in points] for name in ("n_gaussians", "drop", "standard_error"))
     axes.errorbar(counts, drops, yerr=errors, color=BLUE, marker="o", ms=4, capsize=3)
@@ -177,10 +177,10 @@ def report_html(folder: Path, result: dict[str, Any], shown: Sequence[Shown]) ->
         (f"{chosen['n_bytes'] / 1e6:.2f} MB", f"PLY, from {result['all']['n_bytes'] / 1e6:.2f} MB"),
     ]
     if not result["is_unchanged"]:
-        figures.append((f"{_with_error(chosen)} dB", f"drop and standard error, {n_views} held-out training views"))
+        figures.append((f"{_format_drop(chosen)} dB", f"drop and standard error, {n_views} held-out training views"))
     if test is not None:
         figures.append((f"{test['psnr_after']:.2f} dB", f"test PSNR, from {test['psnr_before']:.2f} dB"))
-    svgs = [to_svg(_figure(result, draw_on)) for draw_on in (_draw_psnr, _draw_drop)]
+    svgs = [to_svg(_figure(result, plot_on)) for plot_on in (_plot_psnr, _plot_drop)]
     sections = [
         cards(figures),
         section(

@@ -16,8 +16,8 @@ from minisplat_ref.app.runs.opened_run import Run, open_run
 from minisplat_ref.app.runs.rate_distortion import Point, paired_drop
 from minisplat_ref.app.runs.scoring import score, to_metrics
 from minisplat_ref.app.runs.settings import save_model
-from minisplat_ref.app.runs.simplification import Decision, Target, decide, finish, is_merged, measuring
-from minisplat_ref.app.runs.simplification_report import Shown, draw, report_html
+from minisplat_ref.app.runs.simplification import Decision, Target, decide, finish, is_merged, make_measure
+from minisplat_ref.app.runs.simplification_report import Shown, plot, report_html
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.types import Floats, Model, View
@@ -26,7 +26,7 @@ RESULT, FIGURE = "result.json", "figure.png"  # the decision, in addition to the
 N_SHOWN = 3  # test views
 
 
-class Asked(NamedTuple):
+class SimplifyOptions(NamedTuple):
     """The options of the command line."""
 
     run: Path
@@ -38,7 +38,7 @@ class Asked(NamedTuple):
     """The present folder of the photographs, if they have moved."""
 
 
-def simplify_run(asked: Asked) -> dict[str, Any]:
+def simplify_run(options: SimplifyOptions) -> dict[str, Any]:
     """Simplify a run into a new folder; where it is as small as it gets, that holds the run's own model.
 
     Returns
@@ -51,21 +51,21 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
     InputError
         The run, its photographs or the folder cannot be used, or not even one Gaussian fits; there is no folder then.
     """
-    with making_folder(asked.out) as folder:
-        run = open_run(asked.run, asked.scene)
-        decision = decide(run, asked.target, measuring(run, asked.fine_tune))
+    with making_folder(options.out) as folder:
+        run = open_run(options.run, options.scene)
+        decision = decide(run, options.target, make_measure(run, options.fine_tune))
         is_unchanged, n = decision.is_unchanged, decision.chosen.n_gaussians
-        model = run.model if is_unchanged else finish(run, n, asked.fine_tune)
+        model = run.model if is_unchanged else finish(run, n, options.fine_tune)
         save_model(folder, run.settings, model, run.scene.frame)
         views, render_settings = run.scene.test_views, run.render_settings
         after = score(folder, views, model, render_settings)
         before = after if is_unchanged else evaluate(run.model, views, render_settings)
-        result = {**to_result(run, asked, decision), "test": of_test_views(before, after)}
+        result = {**to_result(run, options, decision), "test": compare_test_views(before, after)}
         _write_run(folder, run, result, after)
         run_folder.write_json(folder / RESULT, result)
-        save_png(draw(result), folder / FIGURE)
+        save_png(plot(result), folder / FIGURE)
         (folder / run_folder.REPORT).write_text(
-            report_html(asked.out, result, _render_both(run, model)), encoding="utf-8"
+            report_html(options.out, result, _render_both(run, model)), encoding="utf-8"
         )
     return result
 
@@ -88,37 +88,37 @@ def _render_both(run: Run, model: Model) -> list[Shown]:
     return [Shown(view.name, view.image, before[view.name], after[view.name]) for view in views]
 
 
-def to_result(run: Run, asked: Asked, decision: Decision) -> dict[str, Any]:
+def to_result(run: Run, options: SimplifyOptions, decision: Decision) -> dict[str, Any]:
     """Return the decision on a size, for JSON."""
     size = run.scene.train_views[0].camera
     return {
-        "run": str(asked.run.resolve()),
+        "run": str(options.run.resolve()),
         "scene": run.scene.name,
         "size": [size.width, size.height],
         "recipe": run.settings.recipe,
         "iterations": run.step,
-        "target": str(asked.target),
-        **asked.target._asdict(),
-        "max_drop": asked.target.limit,
+        "target": str(options.target),
+        **options.target._asdict(),
+        "max_drop": options.target.limit,
         "is_merged": is_merged(run),
-        "fine_tune": asked.fine_tune,
+        "fine_tune": options.fine_tune,
         "folds": len(run.folds),
         "views": [view.name for view in run.scene.train_views],
         "run_psnr": decision.run_psnr,
-        "all": _of_point(decision.reference),
-        "curve": [_of_point(point) for point in decision.points],
-        "chosen": _of_point(decision.chosen),
+        "all": _describe_point(decision.reference),
+        "curve": [_describe_point(point) for point in decision.points],
+        "chosen": _describe_point(decision.chosen),
         "is_unchanged": decision.is_unchanged,
         "is_all_that_matter": decision.is_all_that_matter,
     }
 
 
-def _of_point(point: Point) -> dict[str, Any]:
+def _describe_point(point: Point) -> dict[str, Any]:
     values = {**point._asdict(), "psnrs": list(point.psnrs), "ssims": list(point.ssims)}
     return {**values, "psnr": point.psnr, "ssim": point.ssim}
 
 
-def of_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | None:
+def compare_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | None:
     """Return the change of the test views, for JSON.
 
     Parameters
@@ -157,7 +157,7 @@ def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation
     if (run.folder / run_folder.CAMERAS).exists():
         shutil.copyfile(run.folder / run_folder.CAMERAS, folder / run_folder.CAMERAS)
     else:
-        run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(run.scene))
+        run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.take_fingerprint(run.scene))
     test, lost = result["test"] or {}, _lost(result)
     metrics = {
         "n_gaussians": result["chosen"]["n_gaussians"],

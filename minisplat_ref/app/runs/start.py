@@ -32,7 +32,7 @@ class Start(NamedTuple):
     """Sentences about missing parts of the source."""
 
 
-def start_from(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int) -> Start:
+def make_start(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int) -> Start:
     """Return the start from the scene's points, a file, or the model of a run where the path is a folder.
 
     Parameters
@@ -100,20 +100,21 @@ def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
         )
     state = initial_state(scene, recipe, seed)
     rng = np.random.default_rng(seed)
-    state.gaussians = contiguous(_as_population(folder, model, owner.representation.name, recipe, rng))
+    state.gaussians = contiguous(_convert_population(folder, model, owner.representation.name, recipe, rng))
     state.adam = zero_moments(state.gaussians)
     _check_shared(folder, model, state, recipe)
     state.shared = {name: np.array(model.shared.get(name, first)) for name, first in state.shared.items()}
     state.rng = rng
-    drawn = owner.representation.renderer.name
-    ours = recipe.representation.renderer.name
-    source = f"{n_rows(state.gaussians):,} Gaussians of {folder}, trained with {theirs.recipe} and rendered by {drawn}"
+    theirs_name, our_name = (part.representation.renderer.name for part in (owner, recipe))
+    source = (
+        f"{n_rows(state.gaussians):,} Gaussians of {folder}, trained with {theirs.recipe} and rendered by {theirs_name}"
+    )
     unfinished = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
     notices = [] if saved.unfinished is None else [unfinished]
-    return Start(state, source if drawn == ours else f"{source}, here by {ours}", notices)
+    return Start(state, source if theirs_name == our_name else f"{source}, here by {our_name}", notices)
 
 
-def _as_population(folder: Path, model: Model, name: str, recipe: Recipe, rng: np.random.Generator) -> Any:
+def _convert_population(folder: Path, model: Model, name: str, recipe: Recipe, rng: np.random.Generator) -> Any:
     """Return a model's primitives as the recipe's population.
 
     Raises

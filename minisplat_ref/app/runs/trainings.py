@@ -36,7 +36,7 @@ HEADINGS: dict[Status, str] = {
 REPORTED_CODES = (0, 2, 130)  # after which the training has printed its line of explanation
 
 
-def status_of(folder: Path, asked: Settings) -> Status:
+def find_status(folder: Path, requested: Settings) -> Status:
     """Return the status of the training in a folder.
 
     Raises
@@ -49,19 +49,19 @@ def status_of(folder: Path, asked: Settings) -> Status:
         return "new"
     ours = load(folder)
     for name in NAMES:
-        is_, should = getattr(ours, name), getattr(asked, name)
+        is_, should = getattr(ours, name), getattr(requested, name)
         if is_ != should:
             raise InputError(
                 f"{folder} holds a run of other settings, {name} is {is_} and not {should}: move it away, or give"
                 " another --out"
             )
-    if run_folder.is_finished(folder, asked.iterations):
+    if run_folder.is_finished(folder, requested.iterations):
         return "finished"
     has_checkpoint = any((folder / name).exists() for name in (run_folder.CHECKPOINT, run_folder.PREVIOUS))
     return "cut off" if has_checkpoint else "lost"
 
 
-def words_to_end(folder: Path, asked: Settings, first: Sequence[str]) -> list[str] | None:
+def spell_remaining_command(folder: Path, requested: Settings, first: Sequence[str]) -> list[str] | None:
     """Return the command that completes a training, as words; None if it has ended.
 
     Files of a training without a checkpoint are removed.
@@ -69,12 +69,12 @@ def words_to_end(folder: Path, asked: Settings, first: Sequence[str]) -> list[st
     Parameters
     ----------
     folder : Path
-    asked : Settings
+    requested : Settings
         That it must have.
     first : sequence of str
         The words that begin it.
     """
-    status = status_of(folder, asked)
+    status = find_status(folder, requested)
     if status == "finished":
         return None
     if status == "cut off":
@@ -84,7 +84,7 @@ def words_to_end(folder: Path, asked: Settings, first: Sequence[str]) -> list[st
     return list(first)
 
 
-def words_of(settings: Settings, folder: Path) -> list[str]:
+def spell_command(settings: Settings, folder: Path) -> list[str]:
     """Return the command that begins a training with these settings in a folder, as words."""
     words = ["train", settings.scene, "--out", str(folder)]
     for name in OPTIONS:

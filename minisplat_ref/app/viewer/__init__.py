@@ -4,6 +4,6 @@ The content of a frame is decided without a browser: :mod:`.poses` (the pose of 
 :mod:`.progression` (the size of the next frame), :mod:`.layers` (the layers that it can show). Only :mod:`.browser`
 uses viser, an optional package, and passes the camera of each connected browser to these.
 
-All rendering happens in the thread that calls :meth:`.browser.Viewer.draw_next`, the main one: kernels never run twice
-at once, and during a training frames are rendered between two iterations.
+All rendering happens in the thread that calls :meth:`.browser.Viewer.render_next`, the main one: kernels never run
+twice at once, and during a training frames are rendered between two iterations.
 """

@@ -1,8 +1,8 @@
 """The window of a viewer: a server on this machine, by viser, that browsers connect to.
 
-viser's threads receive the messages of browsers. They only leave it where :meth:`Viewer.draw_next` finds it, which does
-the work in the thread that calls it. Messages of a browser decide what is rendered, never which file is written: a page
-from another site can use this port, too.
+viser's threads receive the messages of browsers. They only leave it where :meth:`Viewer.render_next` finds it, which
+does the work in the thread that calls it. Messages of a browser decide what is rendered, never which file is written: a
+page from another site can use this port, too.
 """
 
 import contextlib
@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 from minisplat_ref.app.reports.images import Image8
 from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.app.viewer.filming import Film, write_travel
-from minisplat_ref.app.viewer.layers import draw, layers_of
+from minisplat_ref.app.viewer.layers import list_layers, render_layer
 from minisplat_ref.app.viewer.photographs import camera_scale
-from minisplat_ref.app.viewer.poses import Pose, camera_of, pose_of, start_at
+from minisplat_ref.app.viewer.poses import Pose, camera_from_pose, choose_start, pose_from_camera
 from minisplat_ref.app.viewer.progression import Shown, Wanted, fit, next_divisor, reduced
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.viewpoints import Viewpoint
@@ -108,7 +108,7 @@ class Viewer:
         self._pixel_seconds: float | None = None
         self._keyframes: list[Pose] = []
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # from viser's threads
-        start = start_at(content.trained.model.gaussians.means, content.cameras)
+        start = choose_start(content.trained.model.gaussians.means, content.cameras)
         server.scene.set_up_direction(tuple(start.up.tolist()))
         initial = server.initial_camera
         initial.position, initial.look_at, initial.up = start.pose.position, tuple(start.target), tuple(start.up)
@@ -118,7 +118,7 @@ class Viewer:
     def _build_panel(self, start: Pose) -> None:
         gui, content = self._server.gui, self._content
         gui.configure_theme(show_logo=False, show_share_button=False)
-        self._layer = gui.add_dropdown("layer", layers_of(content.trained.renderer), initial_value="colour")
+        self._layer = gui.add_dropdown("layer", list_layers(content.trained.renderer), initial_value="colour")
         self._longest = gui.add_slider(
             "pixels", LONGEST_MIN, LONGEST_MAX, 32, LONGEST, hint="of the longer side, once the camera rests"
         )
@@ -140,7 +140,7 @@ class Viewer:
             clear.on_click(lambda _: self._asked.put(self._remove_keyframes))
             write.on_click(lambda event: self._asked.put(lambda: self._write_film(event.client)))
 
-    def say(self, text: str) -> None:
+    def show_status(self, text: str) -> None:
         """Show a line in the panel; of a text that could be markup the markup is shown."""
         self._status.content = "".join(f"\\{c}" if c in "\\`*_{}[]<>#|!" else c for c in text)
 
@@ -149,7 +149,7 @@ class Viewer:
         self._content = self._content._replace(trained=trained)
         self._version += 1
 
-    def draw_next(self) -> bool:
+    def render_next(self) -> bool:
         """Handle the browsers' requests, then render one frame for each that needs one; return whether any did."""
         while not self._asked.empty():
             self._asked.get()()
@@ -170,10 +170,11 @@ class Viewer:
         size = reduced(width, height, divisor)
         window.shown = Shown(wanted, divisor, self._version)
         try:
-            picture = draw(self._content.trained, camera_of(wanted.pose, *size), wanted.layer, wanted.pose.time)
+            camera = camera_from_pose(wanted.pose, *size)
+            picture = render_layer(self._content.trained, camera, wanted.layer, wanted.pose.time)
         except InputError as error:
             self._caption.content, self._layer.value = "", "colour"
-            self.say(str(error))
+            self.show_status(str(error))
             return True
         self._pixel_seconds = (time.perf_counter() - start) / (size[0] * size[1])
         client.scene.set_background_image(picture.image, format="jpeg", jpeg_quality=JPEG_QUALITY)
@@ -191,14 +192,14 @@ class Viewer:
             try:
                 images = {} if self._content.photographs is None else self._content.photographs()
             except InputError as error:
-                self.say(str(error))
+                self.show_status(str(error))
             scale = camera_scale(self._content.cameras)
             self._frustums = [self._frustum(k, view, scale, images) for k, view in enumerate(self._content.cameras)]
         for frustum in self._frustums:
             frustum.visible = is_shown
 
     def _frustum(self, k: int, view: Viewpoint, scale: float, images: dict[str, Image8]) -> Any:
-        pose, camera = pose_of(view.camera, view.time), view.camera
+        pose, camera = pose_from_camera(view.camera, view.time), view.camera
         aspect = camera.fy * camera.width / (camera.fx * camera.height)
         frustum = self._server.scene.add_camera_frustum(
             f"/cameras/{k}",
@@ -222,11 +223,11 @@ class Viewer:
 
     def _add_keyframe(self, client: Any) -> None:
         self._keyframes.append(self._pose(client.camera))
-        self.say(f"{len(self._keyframes)} keyframes")
+        self.show_status(f"{len(self._keyframes)} keyframes")
 
     def _remove_keyframes(self) -> None:
         self._keyframes.clear()
-        self.say("no keyframes")
+        self.show_status("no keyframes")
 
     def _write_film(self, client: Any) -> None:
         path = self._content.film
@@ -235,12 +236,15 @@ class Viewer:
         film = Film(path, float(self._seconds.value), width // 2 * 2, height // 2 * 2, self._layer.value)
         try:
             write_travel(
-                self._content.trained, self._keyframes, film, lambda done, total: self.say(f"film: {done} of {total}")
+                self._content.trained,
+                self._keyframes,
+                film,
+                lambda done, total: self.show_status(f"film: {done} of {total}"),
             )
         except InputError as error:
-            self.say(str(error))
+            self.show_status(str(error))
             return
-        self.say(f"film: {path}")
+        self.show_status(f"film: {path}")
         print(f"film: {path}", flush=True)
 
 
@@ -248,5 +252,5 @@ def serve(viewer: Viewer) -> None:
     """Render for the browsers until Ctrl-C."""
     with contextlib.suppress(KeyboardInterrupt):
         while True:
-            if not viewer.draw_next():
+            if not viewer.render_next():
                 time.sleep(POLL_SECONDS)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from minisplat_ref.app.film import check_film, write_film
 from minisplat_ref.app.runs.scoring import Trained
-from minisplat_ref.app.viewer.layers import draw
-from minisplat_ref.app.viewer.poses import Pose, camera_of, travel
+from minisplat_ref.app.viewer.layers import render_layer
+from minisplat_ref.app.viewer.poses import Pose, camera_from_pose, travel
 from minisplat_ref.io import write_image
 
 FPS = 25.0
@@ -47,8 +47,8 @@ def write_travel(trained: Trained, keyframes: Sequence[Pose], film: Film, on_fra
     with TemporaryDirectory() as folder:
         files = [Path(folder) / f"{k:05d}.png" for k in range(len(path))]
         for k, (file, pose) in enumerate(zip(files, path, strict=True)):
-            camera = camera_of(pose, film.width, film.height)
-            write_image(file, draw(trained, camera, film.layer, pose.time).image)
+            camera = camera_from_pose(pose, film.width, film.height)
+            write_image(file, render_layer(trained, camera, film.layer, pose.time).image)
             on_frame(k + 1, len(path))
         write_film(film.path, files, FPS)
     return len(path)

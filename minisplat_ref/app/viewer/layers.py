@@ -26,7 +26,7 @@ class Picture(NamedTuple):
     """The meaning of its colours, in a few words; empty for the colours themselves."""
 
 
-class Drawn(NamedTuple):
+class RenderedView(NamedTuple):
     """A rendered view."""
 
     output: RenderOutput
@@ -51,43 +51,43 @@ class Layer(NamedTuple):
 
     wants: frozenset[str]
     """The outputs that it needs of the renderer, see :class:`minisplat_ref.rendering.Request`."""
-    picture: Callable[[Drawn], Picture]
+    picture: Callable[[RenderedView], Picture]
     channel: str = "rgb"
     """That the renderer must have."""
 
 
-def _colour(drawn: Drawn) -> Picture:
-    return Picture(to_8_bits(drawn.output.image[..., :3]), "")
+def _colour(rendered: RenderedView) -> Picture:
+    return Picture(to_8_bits(rendered.output.image[..., :3]), "")
 
 
-def _depth(drawn: Drawn) -> Picture:
-    depth = expected_depth(drawn.channel("depth")[..., 0], drawn.output.alpha)  # [H, W]
+def _depth(rendered: RenderedView) -> Picture:
+    depth = expected_depth(rendered.channel("depth")[..., 0], rendered.output.alpha)  # [H, W]
     near, far = depth_range(depth)
     return Picture(depth_image(depth, near, far), f"bright is near: depth {near:.3g} to {far:.3g}")
 
 
-def _alpha(drawn: Drawn) -> Picture:
-    return Picture(colorize(drawn.output.alpha, 0.0, 1.0, "gray"), "accumulated opacity: black 0, white 1")
+def _alpha(rendered: RenderedView) -> Picture:
+    return Picture(colorize(rendered.output.alpha, 0.0, 1.0, "gray"), "accumulated opacity: black 0, white 1")
 
 
-def _transmittance(drawn: Drawn) -> Picture:
+def _transmittance(rendered: RenderedView) -> Picture:
     """Show 1 - alpha in powers of ten: the factor by which the background is visible."""
-    left = np.maximum(1 - drawn.output.alpha, 1e-4)  # [H, W]; where the compositor stops
+    left = np.maximum(1 - rendered.output.alpha, 1e-4)  # [H, W]; where the compositor stops
     return Picture(
         colorize(np.log10(left), -4.0, 0.0, "magma"), "light that passes: dark 0.0001, bright 1 (logarithmic)"
     )
 
 
-def _normal(drawn: Drawn) -> Picture:
+def _normal(rendered: RenderedView) -> Picture:
     return Picture(
-        map_image("normal", drawn.channel("normal"), drawn.output.alpha), "(normal + 1) / 2 as red, green, blue"
+        map_image("normal", rendered.channel("normal"), rendered.output.alpha), "(normal + 1) / 2 as red, green, blue"
     )
 
 
-def _importance(drawn: Drawn) -> Picture:
+def _importance(rendered: RenderedView) -> Picture:
     """Show the weight in the whole view of the Gaussian that dominates a pixel, ``sum w`` over its pixels."""
-    ids = drawn.stats.dominant_ids
-    weights = np.append(drawn.stats.blend_weight_sum, 0)[ids]  # [H, W]; id -1 gets 0
+    ids = rendered.stats.dominant_ids
+    weights = np.append(rendered.stats.blend_weight_sum, 0)[ids]  # [H, W]; id -1 gets 0
     highest = float(weights.max(initial=0.0))
     shown = colorize(np.log1p(weights), 0.0, float(np.log1p(highest)), "inferno")
     return Picture(
@@ -95,15 +95,15 @@ def _importance(drawn: Drawn) -> Picture:
     )
 
 
-def _dominant(drawn: Drawn) -> Picture:
-    ids = drawn.stats.dominant_ids  # [H, W]
+def _dominant(rendered: RenderedView) -> Picture:
+    ids = rendered.stats.dominant_ids  # [H, W]
     return Picture(colors_of_ids(ids), f"{len(np.unique(ids[ids >= 0])):,} Gaussians dominate a pixel, one colour each")
 
 
-def _tile_load(drawn: Drawn) -> Picture:
-    bins = find_bins(drawn.tape)
+def _tile_load(rendered: RenderedView) -> Picture:
+    bins = find_bins(rendered.tape)
     if bins is None:
-        raise InputError(f"renderer {drawn.renderer.name} lists no Gaussians by tile: choose another layer")
+        raise InputError(f"renderer {rendered.renderer.name} lists no Gaussians by tile: choose another layer")
     loads = tile_loads(bins)
     highest = int(loads.max(initial=0))
     return Picture(
@@ -124,12 +124,12 @@ LAYERS: dict[str, Layer] = {
 }
 
 
-def layers_of(renderer: Renderer) -> list[str]:
+def list_layers(renderer: Renderer) -> list[str]:
     """Return the names of the layers whose channels a renderer has."""
     return [name for name, layer in LAYERS.items() if layer.channel in renderer.channels(layer.wants)]
 
 
-def draw(trained: Trained, camera: Camera, layer: str, time: float = 0.0) -> Picture:
+def render_layer(trained: Trained, camera: Camera, layer: str, time: float = 0.0) -> Picture:
     """Render a view and return one layer of it.
 
     Parameters
@@ -151,8 +151,8 @@ def draw(trained: Trained, camera: Camera, layer: str, time: float = 0.0) -> Pic
     settings = RenderSettings(
         trained.background, PROFILES[trained.profile], get_backend(trained.backend), trained.renderer
     )
-    output, tape = settings.render_view(trained.model, view_from(camera, time=time), wants)
-    return LAYERS[layer].picture(Drawn(output, tape, trained.renderer, wants))
+    output, tape = settings.render(trained.model, view_from(camera, time=time), wants)
+    return LAYERS[layer].picture(RenderedView(output, tape, trained.renderer, wants))
 
 
 def colors_of_ids(ids: Ints) -> Image8:

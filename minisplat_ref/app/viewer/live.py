@@ -41,9 +41,9 @@ def make_live_view(server: Any) -> Callable[[Path, Scene, Settings, Progress], C
                         viewer = Viewer(server, content)
                     viewer.show(trained)
                     n_gaussians = len(model.gaussians.means)
-                    viewer.say(f"iteration {report.step:,}, {n_gaussians:,} Gaussians")
+                    viewer.show_status(f"iteration {report.step:,}, {n_gaussians:,} Gaussians")
                     last = time.perf_counter()
-                viewer.draw_next()
+                viewer.render_next()
 
         return on_step
 

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.app.viewer.poses import start_at
+from minisplat_ref.app.viewer.poses import choose_start
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.orbits import orbit
 from minisplat_ref.io.viewpoints import Viewpoint
@@ -64,7 +64,7 @@ def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], b
     if largest > FLOAT16_MAX:
         raise InputError(f"{title}: a coefficient of {largest:g}, beyond {FLOAT16_MAX:g}, is no colour: remove its row")
     views = list(cameras) or orbit(gaussians.means, [], N_VIEWS_WITHOUT_CAMERAS, *CIRCLE_SIZE)
-    start = start_at(gaussians.means, list(cameras))
+    start = choose_start(gaussians.means, list(cameras))
     header, content = pack(gaussians)
     scene = header | {
         "background": np.asarray(background, np.float64).tolist(),

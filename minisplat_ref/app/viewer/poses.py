@@ -43,7 +43,7 @@ class Start(NamedTuple):
     """[3] unit vector."""
 
 
-def camera_of(pose: Pose, width: int, height: int) -> Camera:
+def camera_from_pose(pose: Pose, width: int, height: int) -> Camera:
     """Return the camera of a pose with an image of width x height pixels."""
     w, x, y, z = pose.wxyz
     cam_from_world_R = Rotation.from_quat([x, y, z, w]).as_matrix().T  # [3, 3]
@@ -52,14 +52,14 @@ def camera_of(pose: Pose, width: int, height: int) -> Camera:
     return Camera(cam_from_world_R, t, focal, focal, 0.5 * width, 0.5 * height, width, height)
 
 
-def pose_of(camera: Camera, time: float = 0.0) -> Pose:
+def pose_from_camera(camera: Camera, time: float = 0.0) -> Pose:
     """Return the pose of a camera; of another principal point or lens nothing is left."""
     x, y, z, w = Rotation.from_matrix(np.asarray(camera.cam_from_world_R, np.float64).T).as_quat().tolist()
     fov = 2 * math.atan(0.5 * camera.height / camera.fy)
     return Pose((w, x, y, z), tuple(np.asarray(camera.center, np.float64).tolist()), fov, time)
 
 
-def start_at(means: Floats, cameras: Sequence[Viewpoint]) -> Start:
+def choose_start(means: Floats, cameras: Sequence[Viewpoint]) -> Start:
     """Return the start of a viewer: the first camera, or without any the start of the circle of ``render``.
 
     Parameters
@@ -77,7 +77,7 @@ def start_at(means: Floats, cameras: Sequence[Viewpoint]) -> Start:
     position, forward = centres[0], rotations[0, 2]  # [3], [3]
     to_middle = forward if middle is None else middle - position
     distance = max(float(to_middle @ forward), NEAREST_TARGET * float(np.linalg.norm(to_middle)))
-    return Start(pose_of(views[0].camera, views[0].time), position + distance * forward, up)
+    return Start(pose_from_camera(views[0].camera, views[0].time), position + distance * forward, up)
 
 
 def travel(keyframes: Sequence[Pose], n_frames: int) -> list[Pose]:

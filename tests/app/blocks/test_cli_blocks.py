@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref.app.blocks import train as train_module
-from minisplat_ref.app.blocks.plan import load_asked, load_plan, too_large
+from minisplat_ref.app.blocks.plan import load_block_training, load_plan, too_large
 from minisplat_ref.app.cli import main, train_blocks
 from minisplat_ref.app.runs import cluster
 from minisplat_ref.datasets.synthetic import make_scene
@@ -87,7 +87,7 @@ def test_the_whole_is_of_the_cores(finished):
 
 
 def test_blocks_start_from_the_coarse_model_in_their_regions(finished):
-    asked, plan = load_asked(finished), load_plan(finished)
+    training, plan = load_block_training(finished), load_plan(finished)
     coarse = load_ply(finished / "blocks" / "coarse" / "point_cloud.ply").means
     for planned in plan.blocks:
         settings = read_json(finished / "blocks" / planned.block.name / "config.json")["settings"]
@@ -95,7 +95,7 @@ def test_blocks_start_from_the_coarse_model_in_their_regions(finished):
         (first, *_) = (finished / "blocks" / planned.block.name / "log.jsonl").read_text().splitlines()
         expected = planned.block.region.contains(plan.plane.coordinates(coarse)).sum()
         assert json.loads(first)["n_gaussians"] == expected < len(coarse)
-    assert asked.shape == (2, 1)
+    assert training.shape == (2, 1)
 
 
 def test_a_block_reads_nothing_of_the_model(scene_folder, finished, tmp_path, monkeypatch):
@@ -179,15 +179,15 @@ def test_adaptive_decides_for_each_block(scene_folder, tmp_path, monkeypatch):
 
 
 def test_memory_is_foreseen(finished):
-    asked, plan = load_asked(finished), load_plan(finished)
+    training, plan = load_block_training(finished), load_plan(finished)
     for planned in plan.blocks:  # at most 8 photographs of 32 x 24, and 120 Gaussians of 59 numbers, 4 times
         assert planned.megabytes == 1
     large = plan._replace(blocks=tuple(p._replace(megabytes=m) for p, m in zip(plan.blocks, (300, 500), strict=True)))
-    assert too_large(asked, large, 2, 800e6) is None and too_large(asked, large, 1, 500e6) is None
-    sentence = too_large(asked, large, 2, 799e6)
+    assert too_large(training, large, 2, 800e6) is None and too_large(training, large, 1, 500e6) is None
+    sentence = too_large(training, large, 2, 799e6)
     assert sentence.startswith("the 2 largest blocks take 0.8 GB with photographs and first Gaussians, and 0.8 GB are")
     assert "; give fewer --workers, or begin again with a finer grid, such as --blocks 2x2" in sentence
-    alone = too_large(asked._replace(shape=(1, 2)), large, 1, 1e6)
+    alone = too_large(training._replace(shape=(1, 2)), large, 1, 1e6)
     assert alone.startswith("the largest block takes 0.5 GB with photographs") and "--workers" not in alone
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.depth_maps import DepthKind
 from minisplat_ref.app.runs.mesh_report import report_html
-from minisplat_ref.app.runs.meshing import Asked, mesh_run, open_for_mesh
+from minisplat_ref.app.runs.meshing import MeshOptions, mesh_run, open_for_mesh
 from minisplat_ref.app.runs.run_folder import CAMERAS
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -64,10 +64,10 @@ def test_a_run_becomes_a_mesh_and_a_page(run, tmp_path, capsys):
 def test_the_surface_is_where_the_depths_are(kind, run):
     """Points that a camera's depth shows lie on the mesh, half of them within one and a half voxels of a vertex."""
     opened = open_for_mesh(run)
-    asked = Asked(run, kind, voxel=0.1)
-    meshed = mesh_run(opened, asked)
+    options = MeshOptions(run, kind, voxel=0.1)
+    meshed = mesh_run(opened, options)
     view = opened.views[0]
-    depth, camera = opened.map_of(view, kind).depth, opened.camera_of(view)
+    depth, camera = opened.render_map(view, kind).depth, opened.adapt_camera(view)
     y, x = np.nonzero(depth)
     rays = np.column_stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))])
     points = (depth[y, x][:, None] * rays - camera.cam_from_world_t) @ camera.cam_from_world_R
@@ -87,14 +87,14 @@ def test_without_bounds_it_reaches_further(run, tmp_path, capsys):
 def test_the_mesh_is_in_the_frame_of_the_files(run):
     """A run that is rendered in another frame gives the same mesh, moved and scaled, and the voxel is in its unit."""
     opened = open_for_mesh(run)
-    here = mesh_run(opened, Asked(run, voxel=0.1))
+    here = mesh_run(opened, MeshOptions(run, voxel=0.1))
     frame = Frame((1000.0, -50.0, 3.0), 2.0)
-    there = mesh_run(opened._replace(frame=frame), Asked(run, voxel=0.2))
+    there = mesh_run(opened._replace(frame=frame), MeshOptions(run, voxel=0.2))
     assert_allclose(there.mesh.vertices, 2 * here.mesh.vertices + frame.origin, rtol=CLOSED_FORM)
     assert (there.voxel, there.shape) == (pytest.approx(0.2), here.shape)
-    asked, name = Asked(run), run / "x.ply"
+    options, name = MeshOptions(run), run / "x.ply"
     moved = opened._replace(frame=frame)
-    pages = (report_html(moved, asked, there, name), report_html(opened, asked, here, name))
+    pages = (report_html(moved, options, there, name), report_html(opened, options, here, name))
     ours, theirs = (re.findall('data:image[^"]*', page) for page in pages)
     assert len(ours) == 12 and ours == theirs
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from minisplat_ref.app.cli import _parser_of, demo, main
+from minisplat_ref.app.cli import _find_parser, demo, main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from run_commands import interrupt_at
@@ -37,7 +37,7 @@ def scene(elsewhere):
     return "SCENE"
 
 
-def words_of(line):
+def spell_command(line):
     """Return the arguments of a line that calls the program; None for another line."""
     call = PROGRAM.search(line)
     return None if call is None else shlex.split(line[call.end() :], comments=True)
@@ -47,20 +47,20 @@ def readme_chain():
     """Return the commands of the block about one's own photographs."""
     section = README.read_text(encoding="utf-8").partition("\n## Your own photographs\n")[2].partition("\n## ")[0]
     block = section.split("```")[1]
-    return [words for line in block.splitlines() if (words := words_of(line)) is not None]
+    return [words for line in block.splitlines() if (words := spell_command(line)) is not None]
 
 
 def recommended_in(page):
     """Return the commands that a report shows."""
     blocks = re.findall(r"<pre[^>]*>(.*?)</pre>", page.read_text(encoding="utf-8"), re.DOTALL)
     lines = [line for block in blocks for line in html.unescape(block).splitlines()]
-    return [words for line in lines if (words := words_of(line)) is not None]
+    return [words for line in lines if (words := spell_command(line)) is not None]
 
 
 def printed_in(text):
     """Return the commands that messages name, to the end of the line or of the sentence's part."""
     lines = [line for line in text.splitlines() if "minisplat-ref: error" not in line]
-    return [words for line in lines for part in re.split(r"[;`]", line) if (words := words_of(part)) is not None]
+    return [words for line in lines for part in re.split(r"[;`]", line) if (words := spell_command(part)) is not None]
 
 
 def run_all(commands, capsys):
@@ -73,7 +73,7 @@ def run_all(commands, capsys):
             continue
         capsys.readouterr()
         if words[0] == "view":  # serves until Ctrl-C
-            assert _parser_of(words).parse_args(words).input.exists()
+            assert _find_parser(words).parse_args(words).input.exists()
             continue
         assert main(words) == 0, f"minisplat-ref {' '.join(words)}: {capsys.readouterr().err}"
         done.append(words)

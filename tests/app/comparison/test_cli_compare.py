@@ -248,7 +248,7 @@ def test_runs_go_seed_by_seed():
         ("a", 300, 5),
         ("b", 100, 5),
     ]
-    assert [run.folder for run in plan().runs_of("b")] == [Path("out/b-seed0"), Path("out/b-seed5")]
+    assert [run.folder for run in plan().list_runs("b")] == [Path("out/b-seed0"), Path("out/b-seed5")]
 
 
 def test_options_go_to_the_recipes_that_take_them(monkeypatch):

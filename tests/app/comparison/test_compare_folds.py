@@ -69,7 +69,7 @@ def test_interrupted_and_continued(stopped, compared):
         assert (folder / run / "point_cloud.ply").read_bytes() == (stopped / run / "point_cloud.ply").read_bytes()
     plan = load_plan(folder)
     for run in plan.runs:
-        assert load_settings(run.folder) == runs_module.settings_of(plan, run)
+        assert load_settings(run.folder) == runs_module.make_settings(plan, run)
 
 
 def test_each_photograph_is_held_out_once(compared):
@@ -182,8 +182,8 @@ def test_the_difference_is_paired_by_photograph():
     first = RecipeMetrics("a", runs, photographs(10.0, 20.0, 30.0))
     other = RecipeMetrics("b", runs, photographs(11.0, 22.0, 33.0))
     psnr = METRICS[0]
-    assert first.spread_of(psnr) == Spread(20.0, 10.0)
-    assert first.error_of(psnr) == pytest.approx(10 / math.sqrt(3), rel=CLOSED_FORM)
+    assert first.compute_spread(psnr) == Spread(20.0, 10.0)
+    assert first.compute_error(psnr) == pytest.approx(10 / math.sqrt(3), rel=CLOSED_FORM)
     assert other.error_of_difference(psnr, first) == pytest.approx(1 / math.sqrt(3), rel=CLOSED_FORM)
     rows = {title: cells for title, *cells in table_cells([first, other])}
     assert rows["PSNR (dB)"] == ["20.00 ± 5.77", "22.00 ± 6.35 (+2.00 ± 0.58)"]

@@ -16,7 +16,7 @@ import pytest
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.comparison import runs as runs_module
 from minisplat_ref.app.comparison.plan import Plan, load_plan, save_plan
-from minisplat_ref.app.comparison.runs import settings_of, statuses
+from minisplat_ref.app.comparison.runs import make_settings, statuses
 from minisplat_ref.app.runs.progress import Progress, read_log
 from minisplat_ref.app.runs.settings import load as load_settings
 from minisplat_ref.datasets.synthetic import make_scene
@@ -177,7 +177,7 @@ def test_the_plan_comes_back(tmp_path, monkeypatch):
 def test_settings_are_those_that_train_writes(stopped):
     """Of a run that compare has trained, by the whole of config.json."""
     plan = load_plan(stopped)
-    assert load_settings(stopped / FIRST) == settings_of(plan, plan.runs[0])
+    assert load_settings(stopped / FIRST) == make_settings(plan, plan.runs[0])
 
 
 def test_killed_with_its_training(scene_folder, tmp_path):

@@ -14,7 +14,7 @@ from minisplat_ref.app.runs import opened_run, simplification
 from minisplat_ref.app.runs.opened_run import N_FOLDS, open_run
 from minisplat_ref.app.runs.progress import PSNR_MAX
 from minisplat_ref.app.runs.rate_distortion import CLOSE, PlySize, Point, next_size, paired_drop, smallest_within
-from minisplat_ref.app.runs.simplification import DEFAULT_DROP, Target, decide, fine_tuning, measuring
+from minisplat_ref.app.runs.simplification import DEFAULT_DROP, Target, decide, fine_tuning, make_measure
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError, InputWarning
@@ -198,7 +198,8 @@ def test_a_view_is_measured_by_a_copy_that_never_saw_it(run_folder, monkeypatch)
     names = {view.name for view in run.scene.train_views}
     monkeypatch.setattr(simplification, "train", watched_train)
     monkeypatch.setattr(simplification, "evaluate", watched_evaluate)
-    point = measuring(run, len(names))(50)  # enough iterations for every view to come up; all Gaussians come after it
+    measure_size = make_measure(run, len(names))  # enough iterations for every view to come up
+    point = measure_size(50)  # all Gaussians come after it
     assert len(trained) == len(measured) == 2 * N_FOLDS
     for seen, held_out in zip(trained, measured, strict=True):
         assert seen == names - held_out
@@ -320,14 +321,14 @@ def test_the_search_ends_at_the_limit(run_folder):
     run = open_run(run_folder)
     n, asked = len(run.model.gaussians.means), []
 
-    def point_of(count):
+    def measure_size(count):
         asked.append(count)
         return point(count, 0.0 if count >= 60 else 5.0)
 
-    decision = decide(run, Target(), point_of)
+    decision = decide(run, Target(), measure_size)
     assert not decision.is_unchanged and 60 <= decision.chosen.n_gaussians <= 60 * CLOSE
     assert decision.reference.n_gaussians == n == asked[0] and len(asked) == len(set(asked))
-    assert decide(run, Target(budget=7), point_of).chosen.drop == 5.0, "a budget is kept whatever is lost"
+    assert decide(run, Target(budget=7), measure_size).chosen.drop == 5.0, "a budget is kept whatever is lost"
 
 
 def test_a_budget_of_more_than_all_keeps_all_that_matter(run_folder, scene_folder, tmp_path, capsys):
@@ -449,7 +450,7 @@ def test_a_renderer_without_blend_weights(run_folder, refused, monkeypatch, reas
         return output._replace(stats=None), tape
 
     blind = recipe.representation._replace(renderer=inner._replace(name="blind", render=render))
-    monkeypatch.setattr(opened_run, "recipe_of", lambda settings: recipe._replace(representation=blind))
+    monkeypatch.setattr(opened_run, "configure_recipe", lambda settings: recipe._replace(representation=blind))
     line = refused(run_folder)
     assert "renderer blind of extension core gives no blend weights" in line and reason in line
 

@@ -35,31 +35,31 @@ def test_finest_that_fits_and_coarsest_that_is_good_enough():
     with pytest.raises(InputError, match=r"no level of \.msz fits 10 bytes, the coarsest takes"):
         conversion.finest_within(gaussians, msz.MSZ, 10)
 
-    def psnr_of(given):
+    def measure_psnr(given):
         """Falls with the error of the colours, which is smaller at every finer level."""
         return 30.0 - 100 * np.abs(np.sort(given.sh_dc, axis=0) - np.sort(gaussians.sh_dc, axis=0)).max()
 
-    drops = [30 - psnr_of(msz.decode(msz.encode(gaussians, level), "")) for level in LEVELS]
+    drops = [30 - measure_psnr(msz.decode(msz.encode(gaussians, level), "")) for level in LEVELS]
     for allowed in (0.2, 1.0, 4.0):
-        choice = conversion.coarsest_within(gaussians, msz.MSZ, allowed, psnr_of)
+        choice = conversion.coarsest_within(gaussians, msz.MSZ, allowed, measure_psnr)
         assert choice.level == max(level for level in LEVELS if drops[level] <= allowed)
         assert choice.drop == drops[choice.level]
-    assert len({conversion.coarsest_within(gaussians, msz.MSZ, a, psnr_of).level for a in (0.2, 1.0, 4.0)}) == 3
+    assert len({conversion.coarsest_within(gaussians, msz.MSZ, a, measure_psnr).level for a in (0.2, 1.0, 4.0)}) == 3
     with pytest.raises(InputError, match=r"every level of \.spz loses more than 0 dB"):
-        conversion.coarsest_within(gaussians, spz.SPZ, 0.0, psnr_of)
+        conversion.coarsest_within(gaussians, spz.SPZ, 0.0, measure_psnr)
 
 
 def test_a_drop_that_is_rounding_is_none():
     """Another order of equal depths changes an image in its last bits: level 0 loses nothing all the same."""
     gaussians = population(20)
 
-    def psnr_of(given):
+    def measure_psnr(given):
         if given is gaussians:
             return 30.0
         is_exact = np.array_equal(np.sort(given.sh_dc, axis=0), np.sort(gaussians.sh_dc, axis=0))
         return 30.0 - 2e-7 if is_exact else 29.9
 
-    assert conversion.coarsest_within(gaussians, msz.MSZ, 0.0, psnr_of).level == 0
+    assert conversion.coarsest_within(gaussians, msz.MSZ, 0.0, measure_psnr).level == 0
 
 
 @pytest.mark.parametrize(("max_drop", "level"), [(0.05, 2), (0.0499, 1), (0.01, 1), (0.00998, 0), (0.0, 0)])
@@ -67,12 +67,12 @@ def test_no_more_is_lost_than_was_allowed(max_drop, level):
     """Three levels lose 0, 0.01 and 0.05 dB."""
     losses = (0.0, 0.01, 0.05)
     decode = {str(k).encode(): object() for k in range(3)}
-    psnr_of = {id(found): 30.0 - loss for found, loss in zip(decode.values(), losses, strict=True)}
+    measure_psnr = {id(found): 30.0 - loss for found, loss in zip(decode.values(), losses, strict=True)}
     whole = population(1)
     format_ = Format(
         ".x", "", ("",) * 3, 0, lambda _, k: str(k).encode(), lambda content, _: decode[content], lambda *_: []
     )
-    choice = conversion.coarsest_within(whole, format_, max_drop, lambda g: psnr_of.get(id(g), 30.0))
+    choice = conversion.coarsest_within(whole, format_, max_drop, lambda g: measure_psnr.get(id(g), 30.0))
     assert choice.level == level and choice.drop == pytest.approx(losses[level])
 
 
@@ -151,11 +151,13 @@ def test_a_drop_is_measured_with_the_exposures_of_the_run(run):
     exposures[:, :, 3] = 0.5
     exposed = source._replace(model=source.model._replace(shared={EXPOSURES: exposures}))
 
-    def psnr_of(given, scene=None):
-        return conversion.judge_of(given, run, scene, None).psnr_of(given.model.gaussians)
+    def measure_psnr(given, scene=None):
+        return conversion.make_judge(given, run, scene, None).measure_psnr(given.model.gaussians)
 
-    assert psnr_of(exposed) < psnr_of(source) - 3
-    assert psnr_of(exposed, run.parent / "nook") == psnr_of(source)  # other photographs: they have no exposures
+    assert measure_psnr(exposed) < measure_psnr(source) - 3
+    assert measure_psnr(exposed, run.parent / "nook") == measure_psnr(
+        source
+    )  # other photographs: they have no exposures
 
 
 def test_what_convert_refuses(run, tmp_path, one_line):

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 
 from compact import refused_line
 from minisplat_ref.app.cli import main
-from minisplat_ref.app.runs.model_file import choose_owner, label_of, read_model
+from minisplat_ref.app.runs.model_file import choose_owner, find_label, read_model
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError, InputWarning
@@ -134,7 +134,7 @@ def test_a_setting_of_the_renderer_is_recorded(name, given, recorded, scene, tmp
 def test_compact_files_say_it_too(suffix, run_of, tmp_path, capfd):
     run, file = run_of("rays"), tmp_path / f"a{suffix}"
     convert(run, file, "--level", 0)
-    assert label_of(file) == Label("rays") and (tmp_path / "a.spz.json").exists() == (suffix == ".spz")
+    assert find_label(file) == Label("rays") and (tmp_path / "a.spz.json").exists() == (suffix == ".spz")
     camera = ["--cameras", run / "cameras.json"]
     drawn = images(file, tmp_path / "drawn", *camera)
     if suffix == ".msz":  # whose level 0 loses nothing
@@ -144,7 +144,7 @@ def test_compact_files_say_it_too(suffix, run_of, tmp_path, capfd):
     assert read_label(tmp_path / "back.ply") == Label("rays")
     assert images(tmp_path / "back.ply", tmp_path / "back", *camera) == drawn
     convert(tmp_path / "back.ply", tmp_path / f"again{suffix}", "--level", 0)
-    assert label_of(tmp_path / f"again{suffix}") == Label("rays")
+    assert find_label(tmp_path / f"again{suffix}") == Label("rays")
     capfd.readouterr()
     assert main(["info", str(file)]) == 0
     out = capfd.readouterr().out
@@ -167,7 +167,7 @@ def test_what_a_file_lacks_of_its_run(skies, tmp_path, capfd):
     assert read_label(ply) == label
     convert(skies, tmp_path / "run.msz")
     convert(ply, tmp_path / "ply.spz")
-    assert label_of(tmp_path / "run.msz") == label == label_of(tmp_path / "ply.spz")
+    assert find_label(tmp_path / "run.msz") == label == find_label(tmp_path / "ply.spz")
     for file in (ply, tmp_path / "run.msz", tmp_path / "ply.spz"):
         capfd.readouterr()
         images(file, tmp_path / f"{file.stem}-views", "--cameras", skies / "cameras.json")
@@ -201,7 +201,7 @@ def test_the_user_s_word_counts(run_of, tmp_path, capfd):
     convert(ply, tmp_path / "a.ply", "--extension", "core")
     assert (tmp_path / "a.ply").read_bytes() == unlabelled.read_bytes()
     convert(ply, tmp_path / "a.msz", "--extension", "analytic")
-    assert label_of(tmp_path / "a.msz") == Label("analytic")
+    assert find_label(tmp_path / "a.msz") == Label("analytic")
     capfd.readouterr()
     assert main(["eval", str(run), "--model", str(tmp_path / "a.msz"), "--out", str(tmp_path / "eval")]) == 0
     assert f"says that extension analytic draws it: run {run} draws it otherwise" in capfd.readouterr().err

@@ -8,13 +8,13 @@ from typing import Annotated
 import pytest
 
 from minisplat_ref.app.cli import build_parser, train
-from minisplat_ref.app.runs.options import NAMES, NO_OPTION, OPTIONS, Option, Settings, options_of
+from minisplat_ref.app.runs.options import NAMES, NO_OPTION, OPTIONS, Option, Settings, list_options
 from minisplat_ref.app.runs.settings import CHOICES, METRICS, load
-from minisplat_ref.app.runs.trainings import words_of
+from minisplat_ref.app.runs.trainings import spell_command
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering.backends import BACKENDS, CUDA, CUDA_ATOMIC
 
-OF_ONE_CALL = {field.name for field in fields(train.Request)} - {"given", "server"}
+OF_ONE_CALL = {field.name for field in fields(train.TrainOptions)} - {"given", "server"}
 GIVEN = {
     "downscale": "2",
     "test_every": "4",
@@ -45,7 +45,7 @@ GIVEN = {
 
 
 def settings_from(words):
-    return train.read_request(build_parser().parse_args(words)).new_settings()
+    return train.read_options(build_parser().parse_args(words)).new_settings()
 
 
 def words_for(names):
@@ -99,7 +99,7 @@ def test_what_is_given_is_kept_and_read_again(name, tmp_path):
     assert getattr(settings, name) != getattr(settings_from(["train", "scene"]), name)
     write(tmp_path, asdict(settings))
     assert load(tmp_path) == settings
-    assert settings_from(words_of(settings, tmp_path)) == settings
+    assert settings_from(spell_command(settings, tmp_path)) == settings
     others = set(NAMES) - {name, "iterations", "schedule_iterations"}
     default = Settings(scene=settings.scene, iterations=1, schedule_iterations=1)
     assert all(getattr(settings, other) == getattr(default, other) for other in others)
@@ -169,4 +169,4 @@ def test_a_setting_cannot_be_added_without_help(kind):
         blur: kind = 0
 
     with pytest.raises(TypeError, match="setting blur of Declaration needs an Option with help"):
-        options_of(Declaration)
+        list_options(Declaration)

@@ -136,7 +136,7 @@ def test_the_hash_is_of_the_pixels_and_the_mask_not_of_the_file(original):
     scene = load_scene(original, test_every=0)
 
     def hash_of(changed):
-        return fingerprint.of_scene(scene._replace(train_views=(changed,)))[0]["photograph"]
+        return fingerprint.take_fingerprint(scene._replace(train_views=(changed,)))[0]["photograph"]
 
     plain = hash_of(view)
     assert hash_of(view._replace(image=view.image.copy(order="F"))) == plain  # the same pixels otherwise in memory

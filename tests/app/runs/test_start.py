@@ -13,7 +13,7 @@ from minisplat_ref.app.comparison import runs
 from minisplat_ref.app.runs.checkpoints import newest_model
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.app.runs.settings import load
-from minisplat_ref.app.runs.start import load_start, start_from
+from minisplat_ref.app.runs.start import load_start, make_start
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -233,7 +233,7 @@ def scene_of(scene_folder):
 def test_a_run_goes_on_where_it_ended(few, scene_folder):
     """Every field is that of the result, and so is the exposure; moments begin afresh."""
     recipe = configure(find_recipe("3dgs", 10), exposure=True)
-    start = start_from(few, scene_of(scene_folder), recipe, 0)
+    start = make_start(few, scene_of(scene_folder), recipe, 0)
     saved = newest_model(few, load(few)).model
     for name, field in start.state.gaussians._asdict().items():
         assert_array_equal(field, getattr(saved.gaussians, name), err_msg=name)
@@ -256,13 +256,13 @@ def test_a_run_goes_on_where_it_ended(few, scene_folder):
 )
 def test_parameters_that_a_recipe_lacks_are_named(few, scene_folder, recipe, settings, says):
     with pytest.raises(InputError, match=says):
-        start_from(few, scene_of(scene_folder), configure(find_recipe(recipe, 10), **settings), 0)
+        make_start(few, scene_of(scene_folder), configure(find_recipe(recipe, 10), **settings), 0)
 
 
 def test_another_number_of_photographs_is_refused(few, scene_folder):
     scene = place_scene(load_scene(scene_folder, test_every=2))
     with pytest.raises(InputError, match="give the photographs of that run, divided by the same --test-every"):
-        start_from(few, scene, configure(find_recipe("3dgs", 10), exposure=True), 0)
+        make_start(few, scene, configure(find_recipe("3dgs", 10), exposure=True), 0)
 
 
 def test_a_run_of_another_place_is_refused(few, scene_folder):
@@ -272,7 +272,7 @@ def test_a_run_of_another_place_is_refused(few, scene_folder):
         for view in scene.train_views
     ]
     with pytest.raises(InputError, match=r"no training view sees any of its \d+ Gaussians; give a run of scene nook"):
-        start_from(few, scene._replace(train_views=tuple(turned)), find_recipe("3dgs", 10), 0)
+        make_start(few, scene._replace(train_views=tuple(turned)), find_recipe("3dgs", 10), 0)
 
 
 def test_from_one_extension_to_another(scene_folder, tmp_path, capfd):

@@ -10,9 +10,9 @@ from minisplat_ref.app.reports.images import to_8_bits
 from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.app.viewer import progression
 from minisplat_ref.app.viewer.filming import FPS, Film, write_travel
-from minisplat_ref.app.viewer.layers import LAYERS, colors_of_ids, draw, find_bins, layers_of, tile_loads
+from minisplat_ref.app.viewer.layers import LAYERS, colors_of_ids, find_bins, list_layers, render_layer, tile_loads
 from minisplat_ref.app.viewer.photographs import SCALE, camera_scale
-from minisplat_ref.app.viewer.poses import Pose, camera_of, pose_of, start_at, travel
+from minisplat_ref.app.viewer.poses import Pose, camera_from_pose, choose_start, pose_from_camera, travel
 from minisplat_ref.app.viewer.progression import Shown, Wanted, coarse_divisor, fit, next_divisor, reduced
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
@@ -39,7 +39,7 @@ def trained():
 def test_a_pose_and_its_camera():
     """cos 45 + j sin 45 turns the camera's z to the world's x: seen along x, from x = -2."""
     half = math.sqrt(0.5)
-    camera = camera_of(Pose((half, 0.0, half, 0.0), (-2.0, 0.0, 0.0), math.radians(90.0)), 80, 60)
+    camera = camera_from_pose(Pose((half, 0.0, half, 0.0), (-2.0, 0.0, 0.0), math.radians(90.0)), 80, 60)
     np.testing.assert_allclose(camera.cam_from_world_R @ [1, 0, 0], [0, 0, 1], atol=1e-12)  # rounding of float64
     np.testing.assert_allclose(camera.center, [-2, 0, 0], atol=1e-12)
     assert (camera.fx, camera.fy) == pytest.approx((30.0, 30.0))  # half the height at 45 degrees
@@ -48,10 +48,10 @@ def test_a_pose_and_its_camera():
 
 def test_there_and_back():
     camera = make_camera(rng=np.random.default_rng(3), fx=28.0)
-    again = camera_of(pose_of(camera, 0.25), camera.width, camera.height)
+    again = camera_from_pose(pose_from_camera(camera, 0.25), camera.width, camera.height)
     for name in ("cam_from_world_R", "cam_from_world_t", "fx", "fy"):
         np.testing.assert_allclose(getattr(again, name), getattr(camera, name), atol=1e-12)
-    assert pose_of(camera, 0.25).time == 0.25
+    assert pose_from_camera(camera, 0.25).time == 0.25
 
 
 def test_a_path_reaches_its_keyframes_without_overshoot():
@@ -71,21 +71,23 @@ def test_where_it_starts():
     """At the first camera, about the point of its axis nearest to where the axes meet; or on render's circle."""
     half = math.sqrt(0.5)
     poses = [Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -4.0), 1.0), Pose((half, 0.0, half, 0.0), (-4.0, 0.0, 0.0), 1.0)]
-    cameras = [Viewpoint(f"{k}", camera_of(pose, 8, 6), "train", 0.5) for k, pose in enumerate(poses)]
-    start = start_at(np.zeros((0, 3)), cameras)
+    cameras = [Viewpoint(f"{k}", camera_from_pose(pose, 8, 6), "train", 0.5) for k, pose in enumerate(poses)]
+    start = choose_start(np.zeros((0, 3)), cameras)
     np.testing.assert_allclose(np.hstack(start.pose), np.hstack(poses[0]._replace(time=0.5)), atol=1e-9)
     np.testing.assert_allclose(start.target, [0, 0, 0], atol=0.02)  # the damping of nearest_to_axes
     np.testing.assert_allclose(start.up, [0, -1, 0], atol=1e-9)
     means = np.array([[5.0, 1.0, 2.0]]) + np.random.default_rng(0).normal(size=(40, 3))
-    start, middle = start_at(means, []), np.median(means, axis=0)
+    start, middle = choose_start(means, []), np.median(means, axis=0)
     np.testing.assert_allclose(start.target, middle, atol=1e-9)
     np.testing.assert_allclose(start.up, [0, -1, 0])
-    assert np.isfinite(np.hstack(start_at(means[:0], []).pose)).all()
+    assert np.isfinite(np.hstack(choose_start(means[:0], []).pose)).all()
 
 
 def test_how_large_cameras_are_shown():
     """Two cameras 4 apart lie 2 from their mean; one lies at it."""
-    cameras = [Viewpoint("", camera_of(AHEAD._replace(position=(x, 0.0, 0.0)), 8, 6), "", 0.0) for x in (0.0, 4.0)]
+    cameras = [
+        Viewpoint("", camera_from_pose(AHEAD._replace(position=(x, 0.0, 0.0)), 8, 6), "", 0.0) for x in (0.0, 4.0)
+    ]
     assert camera_scale(cameras) == pytest.approx(2 * SCALE)
     assert camera_scale(cameras[:1]) == SCALE
 
@@ -125,9 +127,9 @@ def test_from_coarse_to_full():
 
 
 def test_colours_are_those_of_the_renderer(trained):
-    camera = camera_of(AHEAD, WIDTH, HEIGHT)
+    camera = camera_from_pose(AHEAD, WIDTH, HEIGHT)
     output, _ = render(trained.model.gaussians, camera, background=trained.background, backend=REFERENCE)
-    np.testing.assert_array_equal(draw(trained, camera, "colour").image, to_8_bits(output.image))
+    np.testing.assert_array_equal(render_layer(trained, camera, "colour").image, to_8_bits(output.image))
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -137,7 +139,7 @@ def test_layers_of_one_opaque_ball(layer):
     surfels = load_extension("surfels").representation
     renderer = surfels.renderer if layer == "normals" else SPLATTING
     trained = Trained(Model(population), renderer, np.zeros(3), "GSPLAT_MAIN", REFERENCE.name)
-    picture = draw(trained, camera_of(AHEAD, WIDTH, HEIGHT), layer)
+    picture = render_layer(trained, camera_from_pose(AHEAD, WIDTH, HEIGHT), layer)
     ball, empty = picture.image[HEIGHT // 2, 12].astype(int), picture.image[HEIGHT // 2, WIDTH - 1].astype(int)
     assert picture.image.shape == (HEIGHT, WIDTH, 3) and picture.image.dtype == np.uint8
     assert bool(picture.caption) == (layer != "colour")
@@ -155,8 +157,8 @@ def test_layers_of_one_opaque_ball(layer):
 
 
 def test_a_layer_that_the_renderer_lacks(trained):
-    assert layers_of(SPLATTING) == [name for name in LAYERS if name != "normals"]
-    assert "normals" in layers_of(load_extension("surfels").representation.renderer)
+    assert list_layers(SPLATTING) == [name for name in LAYERS if name != "normals"]
+    assert "normals" in list_layers(load_extension("surfels").representation.renderer)
 
     def without(model, view, request):
         return SPLATTING.render(model, view, request)[0]._replace(stats=None), ()
@@ -164,7 +166,7 @@ def test_a_layer_that_the_renderer_lacks(trained):
     bare = trained._replace(renderer=SPLATTING._replace(name="bare", render=without))
     for layer in ("importance", "dominant Gaussian", "tile load"):
         with pytest.raises(InputError, match=r"renderer bare .* choose another layer"):
-            draw(bare, camera_of(AHEAD, 16, 16), layer)
+            render_layer(bare, camera_from_pose(AHEAD, 16, 16), layer)
 
 
 def test_tile_loads_by_hand():

@@ -16,8 +16,8 @@ from minisplat_ref.app.runs.scoring import Trained
 from minisplat_ref.app.viewer import browser as browser_module
 from minisplat_ref.app.viewer import live
 from minisplat_ref.app.viewer.browser import HOST, Content, Viewer, address, open_server
-from minisplat_ref.app.viewer.layers import draw
-from minisplat_ref.app.viewer.poses import Pose, camera_of, pose_of
+from minisplat_ref.app.viewer.layers import render_layer
+from minisplat_ref.app.viewer.poses import Pose, camera_from_pose, pose_from_camera
 from minisplat_ref.app.viewer.progression import Wanted
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -52,7 +52,7 @@ def trained(x=0.0, color=(0.9, 0.3, 0.1)):
 
 
 def content(**changes):
-    cameras = [Viewpoint("0001", camera_of(AHEAD, *SIZE), "train", 0.0)]
+    cameras = [Viewpoint("0001", camera_from_pose(AHEAD, *SIZE), "train", 0.0)]
     whole = Content(trained(), cameras, lambda: {"0001": np.full((12, 16, 3), 200, np.uint8)}, None)
     return whole._replace(**changes)
 
@@ -71,7 +71,7 @@ def until(viewer, client, is_done):
     messages, end = [], time.perf_counter() + SECONDS
     while not is_done(messages):
         assert time.perf_counter() < end, "it did not come"
-        viewer.draw_next()
+        viewer.render_next()
         messages += client.receive()
     return messages
 
@@ -94,17 +94,17 @@ def test_a_frame_comes_coarse_then_full_and_follows_the_camera(server):
     with connected(server) as client:
         until(viewer, client, full(client))
         assert client.images[0].shape == (16, 16, 3), "coarse at first"
-        assert close_to(client.images[-1], draw(trained(), camera_of(AHEAD, *SIZE), "colour").image)
+        assert close_to(client.images[-1], render_layer(trained(), camera_from_pose(AHEAD, *SIZE), "colour").image)
 
         aside = AHEAD._replace(position=(0.4, 0.0, 0.0))
         client.look(aside.wxyz, aside.position, aside.fov, SIZE)
-        expected = draw(trained(), camera_of(aside, *SIZE), "colour").image
+        expected = render_layer(trained(), camera_from_pose(aside, *SIZE), "colour").image
         until(viewer, client, lambda _: full(client)(_) and close_to(client.images[-1], expected))
 
         viewer.show(trained(color=(0.1, 0.8, 0.2)))
-        expected = draw(trained(color=(0.1, 0.8, 0.2)), camera_of(aside, *SIZE), "colour").image
+        expected = render_layer(trained(color=(0.1, 0.8, 0.2)), camera_from_pose(aside, *SIZE), "colour").image
         until(viewer, client, lambda _: full(client)(_) and close_to(client.images[-1], expected))
-        assert not viewer.draw_next(), "nothing has changed since"
+        assert not viewer.render_next(), "nothing has changed since"
 
 
 def test_layers_and_cameras_are_chosen_in_the_panel(server):
@@ -112,7 +112,7 @@ def test_layers_and_cameras_are_chosen_in_the_panel(server):
     with connected(server) as client:
         until(viewer, client, full(client))
         client.change("layer", "alpha")
-        expected = draw(trained(), camera_of(AHEAD, *SIZE), "alpha").image
+        expected = render_layer(trained(), camera_from_pose(AHEAD, *SIZE), "alpha").image
         until(viewer, client, lambda _: full(client)(_) and close_to(client.images[-1], expected))
         client.change("cameras", True)
         messages = until(viewer, client, lambda m: any(x["type"] == "CameraFrustumMessage" for x in m))
@@ -129,7 +129,7 @@ def test_cameras_are_hidden_again_and_a_click_goes_there(server, monkeypatch):
 
     monkeypatch.setattr(server.scene, "add_camera_frustum", frustum)
     aside = AHEAD._replace(position=(0.4, 0.0, 0.0), fov=0.7)
-    wide = camera_of(aside, *SIZE)._replace(fy=2 * camera_of(aside, *SIZE).fx)
+    wide = camera_from_pose(aside, *SIZE)._replace(fy=2 * camera_from_pose(aside, *SIZE).fx)
     viewer = Viewer(server, content(cameras=[Viewpoint("0001", wide, "train", 0.0)]))
     for is_shown in (True, False, True):
         viewer._show_cameras(is_shown)
@@ -137,7 +137,7 @@ def test_cameras_are_hidden_again_and_a_click_goes_there(server, monkeypatch):
     assert handles[0].aspect == pytest.approx(2 * 4 / 3) and handles[0].image.shape == (12, 16, 3)
     there = SimpleNamespace(wxyz=None, position=None, fov=None)
     clicks[0](SimpleNamespace(client=SimpleNamespace(camera=there, atomic=contextlib.nullcontext)))
-    expected = pose_of(wide, 0.0)
+    expected = pose_from_camera(wide, 0.0)
     assert (there.wxyz, there.position, there.fov) == (expected.wxyz, expected.position, expected.fov)
     assert there.position == pytest.approx((0.4, 0, 0))
 
@@ -225,7 +225,7 @@ def test_a_browser_shows_it(server, tmp_path):
         end = time.perf_counter() + SECONDS
         while not any(window.shown.divisor == 1 for window in viewer._windows.values()):
             assert time.perf_counter() < end, "the browser has not asked for a frame"
-            viewer.draw_next()
+            viewer.render_next()
             time.sleep(0.02)
         assert "layer" in browser.run("document.body.innerText")
         shot = tmp_path / "page.png"
@@ -279,15 +279,15 @@ def test_a_training_is_shown_and_ends_with_the_same_bytes(scene, tmp_path, serve
     options = [*OPTIONS, "--iterations", "6"]
     assert main(["train", str(scene), *options, "--out", str(tmp_path / "alone")]) == 0
     frames = []
-    draw_next = Viewer.draw_next
+    render_next = Viewer.render_next
     monkeypatch.setattr("minisplat_ref.app.viewer.browser.open_server", lambda port, label: server)
 
     def draw_and_receive(viewer):
-        draw_next(viewer)
+        render_next(viewer)
         client.receive()
         frames.append(len(client.images))
 
-    monkeypatch.setattr(Viewer, "draw_next", draw_and_receive)
+    monkeypatch.setattr(Viewer, "render_next", draw_and_receive)
     with connected(server) as client:
         time.sleep(0.2)  # until the server has the camera
         assert main(["train", str(scene), *options, "--out", str(tmp_path / "watched"), "--view"]) == 0

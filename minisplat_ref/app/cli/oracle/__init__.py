@@ -72,7 +72,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def publish(report: "Report", args: argparse.Namespace) -> int:
-    """Print the table and the verdict, write the files that were asked for; return 1 where a case failed, else 0."""
+    """Print the table and the verdict, write the requested files; return 1 where a case failed, else 0."""
     from minisplat_ref.oracle.cases import as_markdown, save_json, verdict
 
     print(f"{report.title}\n\n{as_markdown(report)}\n\n{verdict([report])}")

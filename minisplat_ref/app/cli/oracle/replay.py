@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
 def _recipe(metadata: Mapping[str, Any]) -> "Recipe":
     """Return the recipe of the run; of a training without a run, the one of the name that it had."""
     from minisplat_ref.app.runs.options import Settings
-    from minisplat_ref.app.runs.settings import recipe_of
+    from minisplat_ref.app.runs.settings import configure_recipe
     from minisplat_ref.extensions.extension import find_recipe
 
     settings = metadata["settings"]
-    return recipe_of(Settings(**settings)) if settings else find_recipe(*metadata["recipe"])
+    return configure_recipe(Settings(**settings)) if settings else find_recipe(*metadata["recipe"])

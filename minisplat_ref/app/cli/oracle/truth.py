@@ -1,4 +1,4 @@
-"""``oracle truth``: how far float64 and float32 are from 50 digits."""
+"""``oracle truth``: errors of float64 and float32 against 50 digits."""
 
 import argparse
 
