@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from minisplat_ref.app.listing_file import ARRAYS, read_listing, select, to_arrays, to_json
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import list_scene, load_scene
 from minisplat_ref.io.lens import Lens
 from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing
+from run_commands import write_room
 from scenes import make_camera
 
 SETTINGS = {"n_views": 6, "width": 16, "height": 12, "n_points": 30, "test_every": 4}
@@ -20,9 +19,7 @@ SETTINGS = {"n_views": 6, "width": 16, "height": 12, "n_points": 30, "test_every
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("listed") / "room"
-    write_scene(make_scene("room", supersampling=1, **SETTINGS), folder, SETTINGS)
-    return folder
+    return write_room(tmp_path_factory.mktemp("listed") / "room", **SETTINGS)
 
 
 def through_files(listing, source):

@@ -7,11 +7,19 @@ import pytest
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.progress import Progress
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 20
 RECIPE = ("--recipe", "3dgs-accel")  # which has a schedule
 OPTIONS = [*RECIPE, "--iterations", str(ITERATIONS), "--test-every", "4", "--seed", "3"]
+
+
+def write_room(folder, name="room", **settings):
+    """Write a synthetic scene into a folder, and return it."""
+    write_scene(make_scene(name, supersampling=1, **settings), folder, settings)
+    return folder
 
 
 def read_json(path):

@@ -15,10 +15,8 @@ from minisplat_ref.app.blocks import train as train_module
 from minisplat_ref.app.blocks.plan import load_block_training, load_plan, too_large
 from minisplat_ref.app.cli import main, train_blocks
 from minisplat_ref.app.runs import cluster
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply
-from run_commands import contents, read_json, refused  # noqa: F401  (a fixture)
+from run_commands import contents, read_json, refused, write_room  # noqa: F401  (a fixture)
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 120, "test_every": 4}
 OPTIONS = ["--recipe", "3dgs-accel", "--iterations", "16", "--test-every", "4", "--seed", "3"]
@@ -32,9 +30,7 @@ def in_process(words):
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ from minisplat_ref import InputError, load_ply, load_scene, save_ply
 from minisplat_ref.app.cli import GROUPS, build_parser, demo, main
 from minisplat_ref.app.reports.images import GAP, error_image, to_8_bits
 from minisplat_ref.app.runs.progress import LOG_EVERY, Progress, read_log
-from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.datasets.synthetic import SCENE_NAMES
 from minisplat_ref.interface.arguments import BACKENDS as BACKEND_CHOICES
 from minisplat_ref.interface.arguments import SYNTHETIC_SCENES
 from minisplat_ref.io import read_image
@@ -28,6 +27,7 @@ from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.rendering.backends import BACKENDS, CPU
+from run_commands import write_room
 from tolerances import PSNR_FLOAT32
 
 WIDTH, HEIGHT = 32, 24
@@ -61,9 +61,7 @@ def read_json(path):
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SETTINGS), folder, SETTINGS)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SETTINGS)
 
 
 @pytest.fixture(scope="module")

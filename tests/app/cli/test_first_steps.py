@@ -15,10 +15,9 @@ from minisplat_ref.app.reports.images import GAP
 from minisplat_ref.app.runs.notices import describe_sizes
 from minisplat_ref.app.runs.preview import FILE
 from minisplat_ref.app.runs.progress import Progress
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, read_image
 from minisplat_ref.training.pace import Cooling
+from run_commands import write_room
 
 WIDTH, HEIGHT = 32, 24
 SETTINGS = {"n_views": 6, "width": WIDTH, "height": HEIGHT, "n_points": 60, "test_every": 4}
@@ -26,9 +25,7 @@ SETTINGS = {"n_views": 6, "width": WIDTH, "height": HEIGHT, "n_points": 60, "tes
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SETTINGS), folder, SETTINGS)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SETTINGS)
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,11 @@ from minisplat_ref.app.runs.depth_maps import DepthKind
 from minisplat_ref.app.runs.mesh_report import report_html
 from minisplat_ref.app.runs.meshing import MeshOptions, mesh_run, open_for_mesh
 from minisplat_ref.app.runs.run_folder import CAMERAS
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io.ply_file import read_vertices
 from minisplat_ref.mechanisms.fusion import volume
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
 from minisplat_ref.types import Frame
+from run_commands import write_room
 from tolerances import CLOSED_FORM
 
 pytest.importorskip("skimage")
@@ -30,7 +29,7 @@ TRAIN = ["--recipe", "3dgs-accel", "--test-every", "5", "--iterations", "200"]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder / "nook", SCENE)
+    write_room(folder / "nook", **SCENE)
     assert main(["train", str(folder / "nook"), *TRAIN, "--out", str(folder / "run")]) == 0
     return folder / "run"
 
@@ -131,7 +130,7 @@ def test_a_run_that_shows_no_surface(run, tmp_path, capsys):
 
 
 def test_a_renderer_without_depth(tmp_path, capsys):
-    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
+    write_room(tmp_path / "nook", **SCENE)
     options = ["--recipe", "fans", "--test-every", "5", "--iterations", "5", "--out", str(tmp_path / "run")]
     assert main(["train", str(tmp_path / "nook"), *options]) == 0
     capsys.readouterr()

@@ -9,9 +9,7 @@ import pytest
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.cli import photos as photos_command
 from minisplat_ref.app.runs.proposed_size import comfortable_factor
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
-from run_commands import interrupt_at
+from run_commands import interrupt_at, write_room
 from textured_world import HEIGHT, WIDTH, take_photographs, write_photographs
 
 SCENE = {"n_views": 12, "width": 48, "height": 36, "n_points": 100, "test_every": 8}
@@ -20,7 +18,7 @@ SCENE = {"n_views": 12, "width": 48, "height": 36, "n_points": 100, "test_every"
 @pytest.fixture
 def out(tmp_path):
     """A folder in which the cameras have been found."""
-    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "out" / "scene", SCENE)
+    write_room(tmp_path / "out" / "scene", **SCENE)
     (tmp_path / "photos").mkdir()
     return tmp_path / "out"
 

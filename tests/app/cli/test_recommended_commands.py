@@ -13,9 +13,7 @@ from pathlib import Path
 import pytest
 
 from minisplat_ref.app.cli import _find_parser, demo, main
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
-from run_commands import interrupt_at
+from run_commands import interrupt_at, write_room
 
 README = Path(__file__).parents[3] / "README.md"
 SIZES = {"n_views": 14, "width": 96, "height": 72, "n_points": 120, "test_every": 8}  # README: --downscale 4
@@ -33,7 +31,7 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture(autouse=True)
 def scene(elsewhere):
-    write_scene(make_scene("room", supersampling=1, **SIZES), elsewhere / "SCENE", SIZES)
+    write_room(elsewhere / "SCENE", **SIZES)
     return "SCENE"
 
 

@@ -37,13 +37,12 @@ from minisplat_ref.app.runs.events import Mechanism
 from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.recipe_actions import Fired, remarks, rows
 from minisplat_ref.app.runs.scoring import Trained
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.training.schedule import At, describe
 from minisplat_ref.types import Gaussians, Model
+from run_commands import write_room
 from tolerances import CLOSED_FORM
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -60,9 +59,7 @@ OPTIONS = ["--recipes", ",".join(RECIPE_NAMES), "--iterations", ",".join(map(str
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")

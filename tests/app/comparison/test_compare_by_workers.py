@@ -15,8 +15,7 @@ pytest.importorskip("distributed")
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs import cluster
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
+from run_commands import write_room
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 OPTIONS = ["--recipes", "3dgs-accel", "--seeds", "0,1", "--iterations", "6", "--test-every", "4", "--eval-every", "2"]
@@ -28,9 +27,7 @@ pytestmark = pytest.mark.filterwarnings("default")  # Dask leaves sockets to the
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,7 @@ from minisplat_ref.app.comparison.metrics import METRICS, RecipeMetrics, Spread,
 from minisplat_ref.app.comparison.plan import load_plan
 from minisplat_ref.app.comparison.table import photograph_cells, table_cells
 from minisplat_ref.app.runs.settings import load as load_settings
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
+from run_commands import write_room
 from tolerances import CLOSED_FORM
 
 SCENE = {"n_views": 7, "width": 32, "height": 24, "n_points": 60, "test_every": 0}
@@ -26,9 +25,7 @@ HELD_OUT = ([0, 3, 6], [1, 4], [2, 5])  # of seven photographs
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +148,7 @@ def test_nonsense_is_one_line(scene_folder, tmp_path, capfd, options, message):
 def test_folds_leave_enough_to_train_on(tmp_path, capfd):
     """Of three photographs in two folds, the first holds out two."""
     scene = {**SCENE, "n_views": 3}
-    write_scene(make_scene("room", supersampling=1, **scene), tmp_path / "scene", scene)
+    write_room(tmp_path / "scene", **scene)
     words = ["compare", str(tmp_path / "scene"), "--recipes", "3dgs", "--folds", "2", "--out", str(tmp_path / "out")]
     assert main(words) == 2
     assert "1 training and 2 test view(s)" in capfd.readouterr().err and not (tmp_path / "out").exists()

@@ -19,9 +19,8 @@ from minisplat_ref.app.comparison.plan import Plan, load_plan, save_plan
 from minisplat_ref.app.comparison.runs import make_settings, statuses
 from minisplat_ref.app.runs.progress import Progress, read_log
 from minisplat_ref.app.runs.settings import load as load_settings
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
+from run_commands import write_room
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 12
@@ -31,9 +30,7 @@ FIRST, SECOND = "3dgs-seed0", "3dgs-accel-seed0"
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")

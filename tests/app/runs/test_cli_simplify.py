@@ -15,8 +15,6 @@ from minisplat_ref.app.runs.opened_run import N_FOLDS, open_run
 from minisplat_ref.app.runs.progress import PSNR_MAX
 from minisplat_ref.app.runs.rate_distortion import CLOSE, PlySize, Point, next_size, paired_drop, smallest_within
 from minisplat_ref.app.runs.simplification import DEFAULT_DROP, Target, decide, fine_tuning, make_measure
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_ply, load_scene, save_ply
@@ -28,6 +26,7 @@ from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import merge_neighbours
 from minisplat_ref.training.loop import train
+from run_commands import write_room
 from tolerances import CLOSED_FORM
 
 SCENE = {"n_views": 12, "width": 32, "height": 24, "n_points": 150, "test_every": 6}
@@ -43,9 +42,7 @@ def point(n, drop, error=0.0):
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 def trained(scene_folder, out, *options):
@@ -429,7 +426,7 @@ def test_photographs_that_are_elsewhere(run_folder, scene_folder, refused, tmp_p
 
 def test_too_few_views_to_decide_by(tmp_path, refused):
     options = {**SCENE, "n_views": 3, "test_every": 0}
-    write_scene(make_scene("room", supersampling=1, **options), tmp_path / "scene", options)
+    write_room(tmp_path / "scene", **options)
     command = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "2"]
     assert main([*command, "--recipe", "3dgs-accel", "--test-every", "0"]) == 0
     assert "needs at least 4 training views, some of which are held out in turn to measure what is lost" in refused(

@@ -12,11 +12,10 @@ from minisplat_ref.app.runs import curve
 from minisplat_ref.app.runs import progress as progress_module
 from minisplat_ref.app.runs import run as training
 from minisplat_ref.app.runs.progress import Progress, read_log
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.datasets.synthetic.surface import surface_distance, true_surface
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.metrics import Evaluation
+from run_commands import write_room
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS, EVAL_EVERY = 20, 8
@@ -30,9 +29,7 @@ def train(scene_folder, out, *options):
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,13 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs import events
 from minisplat_ref.app.runs.events import count_published_times, describe, mechanisms, never_fired
 from minisplat_ref.app.runs.progress import Progress, read_log
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.methods.gaussian_splatting import clone_and_split, collect_gradients, prune_faint, reset_opacity
 from minisplat_ref.training.schedule import At, During, Every, SmallerViews
 from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import FiredEvent
+from run_commands import write_room
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 20
@@ -52,9 +51,7 @@ FIRED = [
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 def train(scene_folder, out):

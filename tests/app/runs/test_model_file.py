@@ -10,13 +10,12 @@ from numpy.testing import assert_array_equal
 from compact import refused_line
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.model_file import choose_owner, find_label, read_model
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.extensions.extension import CORE, Extension, load_extension
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, read_label, save_ply
+from run_commands import write_room
 
 SCENE = {"n_views": 4, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 DRAWN = ("rays", "analytic", "antialiasing", "vr", "pixel-order", "fans")
@@ -25,7 +24,7 @@ DRAWN = ("rays", "analytic", "antialiasing", "vr", "pixel-order", "fans")
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("labels")
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder / "nook", SCENE)
+    write_room(folder / "nook", **SCENE)
     return folder / "nook"
 
 

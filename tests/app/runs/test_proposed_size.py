@@ -5,17 +5,14 @@ import re
 import pytest
 
 from minisplat_ref.app.cli import main
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
+from run_commands import write_room
 
 
 @pytest.fixture(scope="module")
 def large_scene(tmp_path_factory):
     """Five portraits, as many as adaptive needs, of 640 x 960 pixels, the smallest that are remarked on."""
     options = {"n_views": 5, "width": 640, "height": 960, "n_points": 60, "test_every": 0}
-    folder = tmp_path_factory.mktemp("scenes") / "large"
-    write_scene(make_scene("room", supersampling=1, **options), folder, options)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "large", **options)
 
 
 def proposals(capsys):

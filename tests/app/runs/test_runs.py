@@ -17,8 +17,6 @@ from minisplat_ref import load_ply, memory
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs import checkpoints, fingerprint, run, run_folder
 from minisplat_ref.app.runs.progress import read_log
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, read_image, write_image
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
@@ -27,15 +25,24 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training import interruption
 from minisplat_ref.training.schedule import action_name
-from run_commands import ITERATIONS, OPTIONS, RECIPE, SCENE, contents, interrupt_at, photograph, read_json, refused  # noqa: F401  (a fixture)
+from run_commands import (  # noqa: F401  (a fixture)
+    ITERATIONS,
+    OPTIONS,
+    RECIPE,
+    SCENE,
+    contents,
+    interrupt_at,
+    photograph,
+    read_json,
+    refused,
+    write_room,
+)
 
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
     """A scene; tests copy it before they change it."""
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +84,7 @@ def stopped_run(scene, folder, step=12):
 
 
 def test_eval_of_another_scene_is_refused_and_changes_nothing(done, tmp_path, refused):
-    write_scene(make_scene("glossy", supersampling=1, **SCENE), tmp_path / "other", SCENE)
+    write_room(tmp_path / "other", "glossy", **SCENE)
     before = contents(done)
     line = refused("eval", done, "--scene", tmp_path / "other")
     assert f"{tmp_path / 'other'} is not the scene of {done}: " in line

@@ -15,8 +15,6 @@ from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.app.runs.settings import load
 from minisplat_ref.app.runs.start import load_start, make_start
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_ply, load_scene
@@ -27,6 +25,7 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train as train_state
 from minisplat_ref.training.recipe_settings import configure
 from photo_scenes import write_colmap
+from run_commands import write_room
 from tolerances import ROUNDED_TO_FLOAT32
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -113,9 +112,7 @@ def test_one_point_in_view_is_enough(photographs, tmp_path):
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes") / "nook"
-    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
-    return folder
+    return write_room(tmp_path_factory.mktemp("scenes") / "nook", **SCENE)
 
 
 @pytest.fixture

@@ -20,14 +20,13 @@ from minisplat_ref.app.viewer.layers import render_layer
 from minisplat_ref.app.viewer.poses import Pose, camera_from_pose, pose_from_camera
 from minisplat_ref.app.viewer.progression import Wanted
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import read_image, save_ply
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Model
-from run_commands import OPTIONS, SCENE, contents, refused  # noqa: F401  (a fixture)
+from run_commands import OPTIONS, SCENE, contents, refused, write_room  # noqa: F401  (a fixture)
 from scenes import as_dtype, balls
 
 SECONDS = 30.0  # until a frame must have come
@@ -271,7 +270,7 @@ def test_without_viser(tmp_path, refused, monkeypatch):
 
 @pytest.fixture
 def scene(tmp_path):
-    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
+    write_room(tmp_path / "nook", **SCENE)
     return tmp_path / "nook"
 
 
