@@ -55,9 +55,9 @@ def resume(folder: Path, options: "TrainOptions") -> int:
     from minisplat_ref.app.runs.preparation import check_memory, prepare_continued
     from minisplat_ref.app.runs.settings import load
 
-    trained_with = load(folder)  # before the folder is held: without a run there is none
+    saved = load(folder)  # before the folder is held, which has to exist
     with run_folder.hold_folder(folder):
-        settings = options.continued_settings(trained_with)
+        settings = options.continued_settings(saved)
         state = checkpoints.load(folder, settings) if run_folder.has_begun(folder) else None
         if state is not None:
             _check_unfinished(folder, state, settings.iterations)
