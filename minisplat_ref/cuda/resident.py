@@ -63,9 +63,11 @@ def activate(gaussians: Gaussians, is_visible: Bools | None) -> Primitives:
     """Return Gaussians of the device after their activations; see :func:`minisplat_ref.rendering.activate`."""
     n, dtype = len(gaussians.means), gaussians.means.dtype
     scales, opacities = empty((n, 3), dtype), empty(n, dtype)
-    drawn = to_device(np.empty(0, np.uint8) if is_visible is None else is_visible.astype(np.uint8))
+    visibility = to_device(np.empty(0, np.uint8) if is_visible is None else is_visible.astype(np.uint8))
     largest = dtype.type(np.finfo(np.float32).max)
-    launch_rows(activate_rows, n, gaussians.log_scales, gaussians.opacity_logits, drawn, largest, *(scales, opacities))
+    launch_rows(
+        activate_rows, n, gaussians.log_scales, gaussians.opacity_logits, visibility, largest, *(scales, opacities)
+    )
     return Primitives(gaussians.means, gaussians.quats, scales, opacities)
 
 

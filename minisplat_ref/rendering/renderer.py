@@ -287,7 +287,7 @@ def as_model(model: Any) -> Model:
     return model if isinstance(model, Model) else Model(model)
 
 
-def lit_from_behind(output: RenderOutput, request: Request) -> RenderOutput:
+def add_light_behind(output: RenderOutput, request: Request) -> RenderOutput:
     """Return the output with the light of :attr:`Request.behind` in its image, as removal changes need it."""
     if request.behind is None:
         return output
@@ -310,7 +310,7 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
         with_stats=bool(wants & _OF_STATS),
         with_median_depth="median_depth" in wants,
     )
-    lit = lit_from_behind(output, request)
+    lit = add_light_behind(output, request)
     extras = {name: extra(tape, lit) for name, extra in _EXTRAS.items() if name in wants}
     return output._replace(extras=extras), tape
 

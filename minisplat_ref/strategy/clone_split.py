@@ -31,8 +31,8 @@ def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
     Parameters
     ----------
     v_means2d : ndarray of shape (V, 2)
-        Gradient with respect to the projected centres, per pixel. Of rows that are drawn as K Gaussians [V, 2 K]: the
-        sum over these counts.
+        Gradient with respect to the projected centres, per pixel. Of rows that are rendered as K Gaussians [V, 2 K]:
+        the sum over these counts.
     width, height : int
         Image size, pixels.
 

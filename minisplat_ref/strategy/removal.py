@@ -70,7 +70,7 @@ def collect_removal_costs(model: Any, views: Sequence[View], settings: RenderSet
     return RemovalCosts(changes, squared_error)
 
 
-def worth_their_place(costs: RemovalCosts, min_slope: float, max_growth: float) -> Ints:
+def select_worthwhile(costs: RemovalCosts, min_slope: float, max_growth: float) -> Ints:
     """Return the rows to keep, ascending: all but those whose slope is below ``min_slope``.
 
     Parameters

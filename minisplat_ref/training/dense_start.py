@@ -88,7 +88,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
         chosen = choose_spread(found, wide, points)
         points, spacings = np.concatenate([points, found[chosen]]), np.concatenate([spacings, wide[chosen]])
         colors = np.concatenate([colors, small.rgb[rows[chosen], columns[chosen]]])
-    stays = ~is_before_sparse(points, views, scene.points) & have_company(points, spacings)
+    stays = ~is_before_sparse(points, views, scene.points) & has_company(points, spacings)
     stays[: len(scene.points)] = True
     return points[stays], colors[stays]
 
@@ -142,7 +142,7 @@ def is_before_sparse(points: Floats, views: Sequence[View], sparse_points: Float
     return found
 
 
-def have_company(points: Floats, spacings: Floats) -> Bools:
+def has_company(points: Floats, spacings: Floats) -> Bools:
     """Return which points [P] have :data:`COMPANY` others within :data:`REACH` times their spacing.
 
     Surfaces are covered densely; what is alone, far behind the scene or in the air, is a mistake of stereo.

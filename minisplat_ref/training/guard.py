@@ -144,7 +144,7 @@ class BadNumbers(InputError):
 
 
 class Guard(NamedTuple):
-    """How often a training's numbers are checked, and what happens when one is not finite."""
+    """The checks of a training's numbers, and the reaction to one that is not finite."""
 
     every: int = 10
     """Iterations from one check of parameters and gradient to the next; the loss is checked in every iteration."""

@@ -38,26 +38,26 @@ SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # share
 
 
 class Training(NamedTuple):
-    """What an iteration depends on besides the state."""
+    """The inputs of an iteration besides the state."""
 
     recipe: Recipe
     """With the calibrations on that the training has switched on."""
     scene: Scene
     """With its training views at their present size."""
     n_halvings: int
-    """How often these were halved."""
+    """Number of times that they were halved."""
     render_settings: RenderSettings
     guard: Guard
     ahead: ReadingAhead
     interruptions: Interruptions
     fetch: Callable[[TrainState], TrainState]
-    """Copies newer arrays of a GPU into the state, as ``fetch`` of the page that iterates."""
+    """Copies arrays into the state where a GPU has newer ones: :func:`fetch`, or the method of its twin."""
 
 
 def iterate(state: TrainState, training: Training) -> StepReport:
     """Do one iteration; an error before the step leaves the state as if the iteration had not begun."""
     guard = training.guard
-    with undrawn_on_error(state):
+    with restore_draws(state):
         case = draw_case(state, training)
         rendered, loss, gradient = differentiate(case, training)
         wrong = guard.check_step(case, loss, gradient)
@@ -78,7 +78,7 @@ def fetch(state: TrainState) -> TrainState:
 
 
 @contextmanager
-def undrawn_on_error(state: TrainState) -> Iterator[None]:
+def restore_draws(state: TrainState) -> Iterator[None]:
     """Undo the random draws of an iteration that fails, the only change of the state before its step."""
     view_order, draws = list(state.view_order), state.rng.bit_generator.state
     try:

@@ -32,7 +32,7 @@ from minisplat_ref.training import iteration
 from minisplat_ref.training.adam import AdamState, adam_step
 from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
-from minisplat_ref.training.iteration import Stepped, Training, draw_case, due_events, run_events, undrawn_on_error
+from minisplat_ref.training.iteration import Stepped, Training, draw_case, due_events, restore_draws, run_events
 from minisplat_ref.training.losses import Loss, LossTerm, photometric
 from minisplat_ref.training.rates import n_coefficients
 from minisplat_ref.training.schedule import BLEND_STATS, DatedEvent, Recipe
@@ -86,7 +86,7 @@ class OnDevice:
         if why := find_obstacle(state, training.recipe, step):
             report = iteration.iterate(self.fetch(state), training)
             return report._replace(notes=(*self._note_once(why), *report.notes))
-        with undrawn_on_error(state):
+        with restore_draws(state):
             case = draw_case(state, training)
             found = self.differentiate(state, case)
             wrong = self.check_step(state, case, found, guard)

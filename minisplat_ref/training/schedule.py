@@ -150,7 +150,7 @@ class Recipe(NamedTuple):
     has_random_background: bool
     """Render each iteration over a random colour rather than the scene's background."""
     events: tuple[Event, ...]
-    """What happens besides gradient steps. Events of the same iteration act in this order."""
+    """Events, besides gradient steps; those of the same iteration act in this order."""
     min_views: int = 1
     """Minimum number of training views."""
     short_run_exponent: float = 0.0
@@ -285,7 +285,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
     fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
     representation = recipe.representation
-    drawn = _named_settings(representation.renderer.render)
+    renderer_settings = _named_settings(representation.renderer.render)
     role = "extend" if representation.from_file is None else "from_file"
     return {
         **fields,
@@ -299,7 +299,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         "representation": {
             "name": representation.name,
             **_describe_function(getattr(representation, role), role),
-            **({"renderer": drawn} if drawn else {}),
+            **({"renderer": renderer_settings} if renderer_settings else {}),
         },
     }
 

@@ -9,7 +9,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, render, render_vjp
 from minisplat_ref.rendering.backends import CPU, REFERENCE
-from minisplat_ref.strategy.removal import RemovalCosts, collect_removal_costs, worth_their_place
+from minisplat_ref.strategy.removal import RemovalCosts, collect_removal_costs, select_worthwhile
 from minisplat_ref.types import Model, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, REMOVAL
@@ -124,10 +124,10 @@ def test_what_is_not_worth_its_place():
     """Four of five slopes are below 1; half of five are two, those of the least slopes, of equals the first."""
     costs = RemovalCosts(np.array([0.8, 0.0, 8.0, 1.6, 1.6]), 10.0)
     assert_allclose(costs.slopes, [0.4, 0.0, 4.0, 0.8, 0.8])
-    assert_array_equal(worth_their_place(costs, 1.0, 1.0), [2])
-    assert_array_equal(worth_their_place(costs, 1.0, 0.5), [2, 3, 4])
-    assert_array_equal(worth_their_place(costs, 1.0, 0.7), [2, 4])
-    assert_array_equal(worth_their_place(costs, 0.0, 1.0), np.arange(5))
+    assert_array_equal(select_worthwhile(costs, 1.0, 1.0), [2])
+    assert_array_equal(select_worthwhile(costs, 1.0, 0.5), [2, 3, 4])
+    assert_array_equal(select_worthwhile(costs, 1.0, 0.7), [2, 4])
+    assert_array_equal(select_worthwhile(costs, 0.0, 1.0), np.arange(5))
 
 
 def test_without_an_error_everything_that_changes_is_worth_it():

@@ -13,7 +13,7 @@ from minisplat_ref.training.dense_start import (
     choose_neighbours,
     choose_spread,
     densify_points,
-    have_company,
+    has_company,
     is_before_sparse,
 )
 from minisplat_ref.training.initial_state import initial_state
@@ -137,10 +137,10 @@ def test_spread_by_hand():
 def test_company_by_hand():
     """Four points of a square of side 1, and one 9 away: within 4 spacings of 0.4 a corner has all others, at 1.41."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [9, 0, 0]])
-    assert list(have_company(points, np.full(5, 0.4))) == [True, True, True, True, False]
-    assert not have_company(points, np.full(5, 0.35)).any()  # 1.4 is less than the diagonal
-    assert have_company(points, np.array([np.inf, 0.1, 0.1, 0.1, 2.3])).tolist() == [True, False, False, False, True]
-    assert have_company(points[:3], np.zeros(3)).all()
+    assert list(has_company(points, np.full(5, 0.4))) == [True, True, True, True, False]
+    assert not has_company(points, np.full(5, 0.35)).any()  # 1.4 is less than the diagonal
+    assert has_company(points, np.array([np.inf, 0.1, 0.1, 0.1, 2.3])).tolist() == [True, False, False, False, True]
+    assert has_company(points[:3], np.zeros(3)).all()
 
 
 def test_new_points_keep_their_distance(synthetic, dense):

@@ -26,8 +26,8 @@ from minisplat_ref.rendering import (
     RenderGradient,
     Request,
     activate,
+    add_light_behind,
     choose_degree,
-    lit_from_behind,
     parameters_vjp,
 )
 from minisplat_ref.rendering.backends import Backend
@@ -221,7 +221,7 @@ def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tupl
         image = np.concatenate([image[:, :, :at], measures.median[:, :, None].astype(dtype), image[:, :, at:]], axis=2)
     extras = {}
     if "removal_changes" in request.wants:
-        extras["removal_changes"] = shown.removal_changes(lit_from_behind(blended, request))
+        extras["removal_changes"] = shown.removal_changes(add_light_behind(blended, request))
     output = blended._replace(
         image=image,
         extras=extras,

@@ -19,7 +19,7 @@ from minisplat_ref.mechanisms.tangent.planes import (
     project_vjp,
 )
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import RenderGradient, Request, activate, choose_degree, lit_from_behind, parameters_vjp
+from minisplat_ref.rendering import RenderGradient, Request, activate, add_light_behind, choose_degree, parameters_vjp
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.rendering.splatting import append_depths
 from minisplat_ref.types import (
@@ -185,7 +185,7 @@ def _extras(p: Prepared, bins: TileBins, output: RenderOutput, request: Request)
         if "dominant_depth" in request.wants:
             extras["dominant_depth"] = np.append(p.footprints.depths, 0)[dominant_ids].astype(p.channels.dtype)
     if "removal_changes" in request.wants:
-        extras["removal_changes"] = p.removal_changes(bins, lit_from_behind(output, request))
+        extras["removal_changes"] = p.removal_changes(bins, add_light_behind(output, request))
     return extras
 
 

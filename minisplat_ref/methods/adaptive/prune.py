@@ -22,7 +22,7 @@ from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
-from minisplat_ref.strategy.removal import collect_removal_costs, worth_their_place
+from minisplat_ref.strategy.removal import collect_removal_costs, select_worthwhile
 from minisplat_ref.training.pace import Decision, Measurement, Pace, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 
@@ -92,7 +92,7 @@ def prune_in_slices(
         if number == 0:
             iteration.say(f"nothing more is pruned: {reason}")
         return
-    rows = worth_their_place(costs, min_slope, max_pruned)
+    rows = select_worthwhile(costs, min_slope, max_pruned)
     if n - len(rows) < SLICE_MIN * n:
         return
     apply_edit(state, keep(state.gaussians, rows))

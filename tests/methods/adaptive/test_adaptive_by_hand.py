@@ -148,7 +148,7 @@ def test_a_displacement_is_a_rotation_by_its_own_focal_length():
 
 
 def rendering(image):
-    return SimpleNamespace(render=lambda *_: (SimpleNamespace(image=image), None))
+    return SimpleNamespace(render_view=lambda *_: (SimpleNamespace(image=image), None))
 
 
 def test_held_out_views_are_measured_in_their_masks_and_as_they_are_shown():
