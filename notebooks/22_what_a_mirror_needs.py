@@ -34,7 +34,7 @@ import numpy as np
 from data_tools.claims import reflective as study
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.extensions.discretized_sdf.model import HALF, opacity_logits
-from minisplat_ref.extensions.texture_splat.reference import REACH, find_corners, tangent_normals
+from minisplat_ref.extensions.texture_splat.textures import REACH, find_corners, tangent_normals
 from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, PER_SURFEL, WITH_OCCLUSION
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, prefilter
 from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE

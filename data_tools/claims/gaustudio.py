@@ -25,8 +25,6 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.gaustudio.alternatives import by_color, from_files
 from minisplat_ref.extensions.gaustudio.commands import all_stages
 from minisplat_ref.extensions.gaustudio.model import sky_opacity
-from minisplat_ref.interface.palette import BLUE, GREY
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.recipe_settings import configure, parse_settings
 from minisplat_ref.training.schedule import Recipe

@@ -20,7 +20,6 @@ from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.style.recipe import Plan, stylise
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.features.filters import CLASSICAL
 from minisplat_ref.reference.pinhole import project_into_image, unproject_depth
 from minisplat_ref.rendering import RenderSettings

@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit import claim
-from data_tools.claims.kit.figures import with_deviation
+from data_tools.claims.kit.figures import subplots
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.extensions.textured.model import frames, meet
 from minisplat_ref.extensions.textured.recipe import fine_tune, measure, prepare
 from minisplat_ref.interface.palette import BLUE, GREY, RED

@@ -500,36 +500,3 @@ def test_features_of_another_recipe_are_refused(run_folder, tmp_path, capfd, mon
     monkeypatch.setattr("minisplat_ref.extensions.cus.recipe.CUS", find_recipe("cus")._replace(name="other"))
     assert main(["cus", "features", str(run_folder), "--out", str(tmp_path / "no")]) == 2
     assert "was trained by recipe cus, without features" in capfd.readouterr().err and not (tmp_path / "no").exists()
-
-
-def test_the_teacher_s_features_are_read_as_their_labels(scene, rng):
-    """Where one of an object's two pixels is taken for another's, one of three pixels that have either label agrees."""
-    directions = study.make_teacher(rng).directions
-    labels = np.array([[0, 1, 2, 3, 4], [0, 1, 2, 3, 4]])
-    view = scene.test_views[0]
-    task = study.Task(scene._replace(test_views=(view,)), "", [directions[labels]], [labels], 3 * directions)
-    right = study.quality(task, lambda view: directions[labels])
-    assert right["iou"] == 1 and abs(right["error"]) < 1e-5
-    half = study.quality(task, lambda view: directions[[[0, 1, 2, 3, 4], [0, 2, 3, 4, 1]]])
-    assert half["iou"] == pytest.approx(1 / 3) and half["error"] > 0.1
-
-
-def test_the_study_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study, "LATENTS", (2, 3))
-    monkeypatch.setattr(study, "QUERIES", (1, 3))
-    monkeypatch.setattr(study, "CUS", configure(find_recipe("cus"), **{**SMALL, "features": ""}))
-    small_room = partial(make_scene, n_views=6, width=48, height=40, supersampling=1, n_points=60)
-    monkeypatch.setattr(study, "make_scene", lambda name, **size: small_room(name))
-    monkeypatch.setattr(study, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
-    words = ["cus/floats", "--iterations", "5", "--seeds", "1", "--out", str(tmp_path / "s")]
-    assert measure_claim(words) == 0
-    records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
-    names = ["anchors, latent 2", "anchors, latent 3", "own queries, 1", "own queries, 3", "adaptive"]
-    assert [r["arm"] for r in records] == names
-    n = records[0]["gaussians"] // 2
-    assert records[2]["floats"] == 2 * n and records[3]["floats"] == 6 * n
-    assert records[1]["floats"] == 3 * n + (3 + 3 + 2) * 4 + 4 + 4 * 3 + 3 + 6 * 3 + 3
-    assert records[4]["all_floats"] == 59 * records[4]["gaussians"]
-    assert all(np.isfinite(r["error"]) and 0 <= r["iou"] <= 1 for r in records[:4])
-    assert records[1]["all_floats"] - records[0]["all_floats"] == n + 4 * 4  # four networks read one number more
-    assert "| adaptive " in capsys.readouterr().out

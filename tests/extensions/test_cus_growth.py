@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions import cus
-from minisplat_ref.extensions.cus import growth
-from minisplat_ref.extensions.cus.growth import (
+from minisplat_ref.extensions.cus.model import ANCHORS, as_anchors, at_rest, voxel_side
+from minisplat_ref.extensions.cus.recipe import (
     COUNT,
     SUM,
     THRESHOLD,
@@ -225,42 +225,3 @@ def test_a_run_grows(often, tmp_path, capfd):
     fired = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     grown = [event for event in fired if event["action"] == "grow_anchors"]
     assert grown and grown[0]["n_after"] > grown[0]["n_before"]
-
-
-def test_the_study_of_growing_runs(often, tmp_path, monkeypatch, capsys):
-    """The threshold is so low that all grows, the points so few that nothing takes long."""
-    monkeypatch.setattr(growth_study, "POINTS", (90, 40))
-    monkeypatch.setattr(growth_study, "THRESHOLD", 1e-6)
-    monkeypatch.setattr(growth_study, "SIZE", {"n_views": 6, "width": 48, "height": 40, "supersampling": 1})
-    monkeypatch.setattr(study, "CUS", configure(find_recipe("cus"), **SMALL))
-    monkeypatch.setattr(study, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
-    monkeypatch.setattr(growth_study, "LATENT", SMALL["latent"])
-    assert measure_claim(["cus/growth", "--iterations", "24", "--seeds", "1", "--out", str(tmp_path / "s")]) == 0
-    records = json.loads((tmp_path / "s" / "result.json").read_text())["records"]
-    assert [r["arm"] for r in records] == [
-        "90 points, without growing",
-        "90 points, with growing",
-        "90 points, smaller voxels",
-        "40 points, without growing",
-        "40 points, with growing",
-    ]
-    anchors = [r["anchors"] for r in records]
-    assert anchors[0] < anchors[1] and anchors[0] < anchors[2] and anchors[3] < anchors[4]
-    per_anchor = 3 + 3 + 3 + 3 + 6  # centre, scale, colour, latent, offsets
-    assert records[1]["all_floats"] - records[0]["all_floats"] == per_anchor * (anchors[1] - anchors[0])
-    assert "| 40 points, with growing " in capsys.readouterr().out
-
-
-def test_the_table_of_growing_by_hand():
-    def record(arm, anchors, psnr, error):
-        return {"arm": arm, "anchors": anchors, "all_floats": 10 * anchors, "psnr": psnr, "error": error, "iou": 0.5}
-
-    names = ("2,000 points, without growing", "2,000 points, with growing")
-    records = [record(names[0], 100, 20, 0.1), record(names[1], 180, 21, 0.2)]
-    records += [record(names[0], 120, 22, 0.3), record(names[1], 240, 21, 0.4)]
-    text = growth_study.report(records, {}, "heading").text
-    header = "| arm | anchors | floats in all | PSNR dB | error of features | mean IoU |"
-    assert header in [" ".join(line.split()) for line in text.splitlines()]
-    rows = [" ".join(line.split()) for line in text.splitlines() if line.startswith("| 2,000")]
-    assert rows[0].startswith(f"| {names[0]} | 110 | 1,100 | 21.00 ± 1.41 | 0.2000 ± 0.1414 | 0.500 ")
-    assert rows[1].startswith(f"| {names[1]} | 210 | 2,100 | 21.00 ± 0.00 | 0.3000 ± 0.1414 | 0.500 ")

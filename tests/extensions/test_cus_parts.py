@@ -14,7 +14,6 @@ from minisplat_ref.extensions.cus.recipe import (
     feature_loss,
     grow_anchors,
     prune_insignificant,
-    read_memory,
 )
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.frames import Unit
@@ -180,61 +179,3 @@ def test_features_are_sampled_without_replacement(rng):
 
 
 # The study
-
-
-def test_the_teacher_by_hand(made, rng):
-    """A label's direction, and 0.3 times the projected texture."""
-    teacher, view = study.make_teacher(rng), made.scene.train_views[0]
-    labels = object_ids(made.train_ids[0])
-    texture = feature_map(view, "")[5, 7] @ teacher.texture
-    expected = teacher.directions[labels[5, 7]] + 0.3 * texture
-    assert_allclose(teacher.features(view, labels)[5, 7], expected, rtol=1e-5)
-    assert_allclose(np.linalg.norm(teacher.directions, axis=1), 1)
-
-
-def test_prototypes_are_means_over_the_training_views(made, tmp_path):
-    task = study.make_task(made, 0, tmp_path)
-    stored = np.stack([np.load(tmp_path / f"{view.name}.npy") for view in made.scene.train_views])
-    labels = np.stack([object_ids(ids) for ids in made.train_ids])
-    label = labels[0, 0, 0]
-    assert_allclose(task.prototypes[label], stored[labels == label].mean(axis=0), rtol=1e-4)
-    assert len(task.targets) == len(task.labels) == len(made.scene.test_views)
-
-
-def test_floats_by_hand(rng):
-    """Two anchors of two Gaussians: centre, scale and colour, three numbers of latent and six of offsets, each."""
-    g = as_anchors(make_gaussians(rng, 2, sh_degree=0), rng, voxel=1e-3, children=2, latent=3)
-    shared = {"query_weights_0": np.zeros((4, 5)), "query_mix_biases_0": np.zeros(7), "memory": np.zeros((2, 2))}
-    assert study.counts(Model(g, shared)) == {"gaussians": 4, "all_floats": 2 * (9 + 3 + 6) + 20 + 7 + 4}
-    assert study.feature_floats(Model(g, shared)) == 2 * 3 + 20 + 7
-    assert study.counts(Model(make_gaussians(rng, 2, sh_degree=0))) == {"gaussians": 2, "all_floats": 28}
-
-
-def test_the_error_of_features_is_the_mean_over_views(made):
-    """A feature of length 1 that is found as zero has an error of 1/32, and a cosine of 0."""
-    scene = made.scene
-    labels = np.zeros((2, 3), np.int64)
-    target = np.zeros((2, 3, study.DIMENSION), np.float32)
-    target[..., 0] = 1
-    views = (scene.test_views[0], scene.train_views[0])
-    task = study.Task(scene._replace(test_views=views), "", [target, target], [labels, labels], np.eye(5, 32))
-    zero = np.zeros_like(target)
-    found = study.quality(task, lambda view: zero if view is views[0] else target)
-    assert_allclose(found["error"], (1 / 32 + 1) / 2, rtol=1e-5)
-
-
-def test_own_queries_learn(made, tmp_path):
-    """Forty iterations leave less than half of the error that one leaves."""
-    task = study.make_task(made, 0, tmp_path)
-    recipe = configure(find_recipe("cus"), **SMALL, features=str(tmp_path))
-    model = initial_state(made.scene, recipe, seed=0).model
-    errors = []
-    for iterations in (1, 40):
-        found = study.own_queries(model, task, 4, iterations, 0)
-
-        def features_of(view, found=found):
-            image, _ = study._blend(model, view, found["queries"])
-            return read_memory(image.reshape(-1, 4), found)[0].reshape(*image.shape[:2], -1)
-
-        errors.append(study.quality(task, features_of)["error"])
-    assert errors[1] < 0.5 * errors[0]

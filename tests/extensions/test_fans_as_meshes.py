@@ -8,8 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from actions import act, scene_of, state_of
-from data_tools.claims.__main__ import main as measure_claim
-from data_tools.claims.fans.profile import fan_profile, mass, profile_error
+from data_tools.claims.fans.profile import fan_profile
 from data_tools.claims.fans.shape_search import alpha_of, best_shape, render_clipped
 from gltf import glb_parts, only_primitive, values
 from minisplat_ref.app.cli import main
@@ -448,27 +447,6 @@ def test_models_that_hold_nothing_are_refused(model, scene_folder, tmp_path, cap
     with pytest.raises(SystemExit, match="2"):
         main([*tune, str(out), "--iterations", "0"])
     assert "--iterations" in capsys.readouterr().err
-
-
-def test_the_studies(scene_folder, model, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("data_tools.claims.fans.measures.REACHES", (2.5,))
-    monkeypatch.setattr("data_tools.claims.fans.measures.SIDES", (4, 8))
-    monkeypatch.setattr("data_tools.claims.fans.measures.VIEWS_MAX", 1)
-    monkeypatch.setattr("data_tools.claims.fans.shape_search.EVALUATIONS", 4)
-    monkeypatch.setattr("data_tools.claims.fans.shape_search.FIRST_REACHES", (2.5,))
-    monkeypatch.setattr("data_tools.claims.fans.profile.ANGLES", (0, 90))
-    refit, profile = tmp_path / "refit", tmp_path / "profile"
-    options = ["--ply", str(model), "--fine-tune", "3", "--out", str(refit)]
-    assert measure_claim(["fans/refit", str(scene_folder), *options]) == 0
-    (run,) = json.loads((refit / "result.json").read_text())["runs"]
-    assert [row["form"] for row in run["rows"] if "triangles" in row][::3] == ["flat fans", "solid fans"]
-    assert (refit / "figure.png").stat().st_size > 10_000 and "| flat fans, vertices" in capsys.readouterr().out
-    assert sorted(path.name for path in refit.iterdir()) == ["figure.png", "result.json"]
-    assert measure_claim(["fans/profile", "--out", str(profile)]) == 0
-    tilts = json.loads((profile / "result.json").read_text())["tilts"]
-    edge_on = {(tilt["kind"], tilt["is_flat"]): tilt["errors"][1] for tilt in tilts}
-    assert edge_on["ball", True] > 0.99 > edge_on["ball", False]
-    assert "| 8     | 2.50  | 0.00 | 12.3%     | 0.94 |" in capsys.readouterr().out
 
 
 def test_fans_of_sparse_points_face_everywhere(rng):

@@ -91,39 +91,3 @@ def test_bad_names_are_one_line(folder, capsys, setting, message):
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert re.search(message, line)
     assert not (folder / "bad").exists()
-
-
-def test_the_study_of_the_sky(folder, tmp_path, capsys):
-    arms = ["--arms", "without,ball+loss", "--iterations", "60", "--seeds", "0"]
-    scene, masks = str(folder / "scene"), ["--masks", str(folder / "masks")]
-    assert measure_claim(["gaustudio/sky", scene, *masks, *arms, "--out", str(tmp_path / "sky")]) == 0
-    without, both = json.loads((tmp_path / "sky" / "result.json").read_text())["records"]
-    assert both["opacity"] < 0.8 * without["opacity"] and both["psnr_sky"] > without["psnr_sky"]
-    assert both["opacity"] < both["opacity_scene"] <= 1
-    assert "| ball+loss" in capsys.readouterr().out
-    assert measure_claim(["gaustudio/sky", scene, "--arms", "moon", "--out", str(tmp_path / "x")]) == 2
-    assert "--arms moon is unknown: choose from without, loss, ball" in capsys.readouterr().err
-
-
-def test_the_study_of_swaps(folder, tmp_path, capsys):
-    options = ["--stages", "photo_loss", "--iterations", "5", "--seeds", "0", "--out", str(tmp_path / "swaps")]
-    assert measure_claim(["gaustudio/swaps", str(folder / "scene"), *options]) == 0
-    records = json.loads((tmp_path / "swaps" / "result.json").read_text())["records"]
-    assert [record["arm"] for record in records] == ["as it is", "photo_loss=l1", "photo_loss=squared"]
-    assert len(study.swaps(study.SWAPPED)) == 1 + sum(
-        len(stage.modules) - 1 for stage in all_stages() if stage.name != "sky_mask"
-    )
-    assert (
-        measure_claim(["gaustudio/swaps", str(folder / "scene"), "--stages", "sky", "--out", str(tmp_path / "y")]) == 2
-    )
-    assert "--stages sky is unknown: choose from initialiser" in capsys.readouterr().err
-
-
-def test_opacity_is_measured_away_from_edges():
-    """By hand: without two pixels along the edge of a mask of 7 x 7 its inner 3 x 3 are left."""
-    assert study.EDGE == 2
-    is_sky = np.zeros((9, 9), bool)
-    is_sky[1:8, 1:8] = True
-    inner = study.binary_erosion(is_sky, iterations=study.EDGE, border_value=1)
-    assert inner.sum() == 9 and inner[3:6, 3:6].all()
-    assert study.psnr_of(np.full(4, 0.01)) == pytest.approx(20) and study.psnr_of(np.zeros(0)) is None

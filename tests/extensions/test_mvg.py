@@ -9,8 +9,7 @@ from numpy.testing import assert_allclose
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.mvg import insertion, recipe
+from minisplat_ref.extensions.mvg import recipe
 from minisplat_ref.extensions.mvg.insertion import (
     Insertions,
     Photographed,

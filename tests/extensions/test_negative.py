@@ -26,7 +26,6 @@ from minisplat_ref.extensions.negative.model import (
     negate,
     with_negatives,
 )
-from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
 from minisplat_ref.rendering.backends import REFERENCE

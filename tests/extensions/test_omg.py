@@ -21,7 +21,6 @@ from minisplat_ref.extensions.omg.codes import fit_codes, quantise
 from minisplat_ref.extensions.omg.file import compute_features, fit_decoder
 from minisplat_ref.extensions.omg.recipe import distinct_importance, local_distinctiveness, prune_indistinct
 from minisplat_ref.extensions.omg.trained_file import read_training
-from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import indoor

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from data_tools.claims.satellite import boxes
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite import affine_fit
-from minisplat_ref.extensions.satellite.losses import shear_of, view_consistency
-from minisplat_ref.extensions.satellite.renderer import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite import cameras
+from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.recipe import make_shear, view_consistency
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
@@ -29,10 +29,10 @@ def test_the_half_diagonal_of_a_photograph_is_one(size, monkeypatch):
     def localise(rpc, pixels, altitudes):
         return np.column_stack([pixels * [0.5, -0.5] + 1000, altitudes])
 
-    monkeypatch.setattr(affine_fit, "localise", localise)
-    monkeypatch.setattr(affine_fit, "zone_of", lambda longitude: 33)
-    monkeypatch.setattr(affine_fit, "utm_from_degrees", lambda x, y, zone, is_south: np.column_stack([x, y]))
-    frame = affine_fit.frame_of([None], size, (20.0, 80.0))
+    monkeypatch.setattr(cameras, "localise", localise)
+    monkeypatch.setattr(cameras, "find_zone", lambda longitude: 33)
+    monkeypatch.setattr(cameras, "utm_from_degrees", lambda x, y, zone, is_south: np.column_stack([x, y]))
+    frame = cameras.choose_frame([None], size, (20.0, 80.0))
     width, height = size
     assert_allclose(frame.scale, np.hypot(width, height) / 4, rtol=CLOSED_FORM)
     assert_allclose(frame.origin, [1000 + width / 4, 1000 - height / 4, 20.0], rtol=CLOSED_FORM)
@@ -52,12 +52,12 @@ def test_a_shear_is_of_the_size_of_the_image():
     """In coordinates of -1 to 1 it has the deviation that is given: half of the width, and of the height, in pixels."""
     high = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4 / boxes.SCALE]])  # altitudes span 4 m, 2 m to either side
     camera = boxes.zenith(40)._replace(height=20)
-    shears = np.array([shear_of(rendered_of(high, camera, step), 0.1) for step in range(2_000)])
+    shears = np.array([make_shear(rendered_of(high, camera, step), 0.1) for step in range(2_000)])
     assert_allclose(shears.std(axis=0), [0.1 * 40 / 2 / 2, 0.1 * 20 / 2 / 2], rtol=0.06)  # 2,000 draws: 1.6 %
     assert np.abs(shears.mean(axis=0)).max() < 0.1 and abs(np.corrcoef(shears.T)[0, 1]) < 0.1
-    twice = np.array([shear_of(rendered_of(2 * high, camera, step), 0.1) for step in range(5)])
+    twice = np.array([make_shear(rendered_of(2 * high, camera, step), 0.1) for step in range(5)])
     assert_allclose(twice, shears[:5] / 2, rtol=CLOSED_FORM)
-    assert shear_of(rendered_of(high, camera, 3), 0.1) == shear_of(rendered_of(high, camera, 3), 0.1)
+    assert make_shear(rendered_of(high, camera, 3), 0.1) == make_shear(rendered_of(high, camera, 3), 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def consistency(monkeypatch, plateau, shift, change=lambda image: image):
     view = view_from(boxes.zenith(24))
     output, _ = SATELLITE.render(model, view, request)
     changed = output._replace(image=change(output.image))
-    monkeypatch.setattr("minisplat_ref.extensions.satellite.losses.shear_of", lambda *_: shift)
+    monkeypatch.setattr("minisplat_ref.extensions.satellite.losses.make_shear", lambda *_: shift)
     rendered = Rendered(changed, CHANNELS, view, scene, model, 1, request)
     return view_consistency(rendered, altitude=0.01, color=0.1, noise=0.0, limit=1.0)[0]
 

@@ -248,22 +248,3 @@ def test_a_baked_view_is_that_view(run_folder, tmp_path, capfd):
     ):
         assert main(["vdgs", "bake", *arguments, "--out", str(tmp_path / "no.ply")]) == 2
         assert expected in capfd.readouterr().err and not (tmp_path / "no.ply").exists()
-
-
-def test_the_pane(tmp_path):
-    arguments = ["vdgs/pane", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "pane")]
-    assert measure_claim(arguments) == 0
-    result = json.loads((tmp_path / "pane" / "result.json").read_text())
-    assert [record["arm"] for record in result["records"]] == [study.HARMONICS, study.TIMES, study.PLUS]
-    truth = study.make_pane(np.random.default_rng(0))
-    front = study.make_pane_scene(truth).train_views[23].camera
-    assert_allclose(study.true_opacities(truth, front)[12], study.F0, atol=0.01)
-
-
-def test_equal_floats(monkeypatch, scene):
-    monkeypatch.setattr("minisplat_ref.extensions.vdgs.model.N_ROWS", 16)
-    recipe = floats_study.arms(3)["colors_plus"]
-    assert floats_study.n_shared(scene, recipe) == 4 * 16 * 2 + 11 * 32 + 32 + 32 * 48 + 48 + 4
-    ours, theirs = (floats_study.measure(scene, 3, 50, arm, 0) for arm in ("colors_plus", floats_study.HARMONICS))
-    assert theirs["floats"] == 50 * 59 and 0 <= theirs["floats"] - ours["floats"] < 59
-    assert ours["gaussians"] == 14

@@ -8,15 +8,13 @@ import numpy as np
 from minisplat_ref.extensions.cuts.model import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.extensions.cuts.model import stages as cuts_stages
 from minisplat_ref.extensions.cuts.response import evaluate_cuts_vjp
-from minisplat_ref.extensions.mixed.gradient_checks import of_all_kinds
-from minisplat_ref.extensions.mixed.gradient_checks import stages as mixed_stages
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.population import as_ellipses
-from minisplat_ref.extensions.mixed.projection import in_plane_vjp
-from minisplat_ref.extensions.textured.gradient_checks import stages as textured_stages
-from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
-from minisplat_ref.extensions.textured.population import with_textures
-from minisplat_ref.extensions.textured.reference import meet_vjp
+from minisplat_ref.extensions.mixed.model import MIXED_GAUSSIANS, mix_kinds
+from minisplat_ref.extensions.mixed.model import stages as mixed_stages
+from minisplat_ref.extensions.mixed.population import make_ellipses
+from minisplat_ref.extensions.mixed.projection import place_vertices_vjp
+from minisplat_ref.extensions.textured.model import add_textures, meet_vjp
+from minisplat_ref.extensions.textured.recipe import TEXTURED_GAUSSIANS
+from minisplat_ref.extensions.textured.recipe import stages as textured_stages
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Gaussians, Model

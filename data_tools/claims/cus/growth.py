@@ -31,7 +31,8 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.cus.model import LATENT
 from minisplat_ref.extensions.cus.recipe import THRESHOLD, grow_anchors
 from minisplat_ref.interface.palette import BLUE, GREY, RED
-from minisplat_ref.training.schedule import Recipe, configure, without
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import Recipe, without
 
 POINTS = (2_000, 300)  # that trainings begin with; the first is as in cus/floats
 WITHOUT, WITH, SMALLER = "without growing", "with growing", "smaller voxels"

@@ -19,7 +19,8 @@ from data_tools.claims.fans import measures as claims
 from data_tools.claims.fans import profile
 from data_tools.claims.fans.profile import profile_error
 from data_tools.claims.fans.shape_search import render_clipped
-from data_tools.claims.kit.figures import mean_and_deviation, show, table_of, with_deviation
+from data_tools.claims.kit.figures import mean_and_deviation, show, subplots, table_of
+from data_tools.claims.kit.tables import first, spread, table
 from minisplat_ref.extensions.fans.model import FanShape
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.interface.progress import progress_bar

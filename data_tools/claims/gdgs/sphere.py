@@ -12,10 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import with_deviation
+from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.extensions.gdgs.model import Weights, attract, contract, densest, disperse, regions_of
 from minisplat_ref.extensions.gdgs.recipe import N_CELLS, N_TOP, on_planes, spacing_of
-from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.mechanisms.oriented.planes import fit_planes
 from minisplat_ref.mechanisms.oriented.thin_axis import angles_between, normals_of
 from minisplat_ref.types import Floats, Gaussians

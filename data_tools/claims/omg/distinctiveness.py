@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.kit.detail import Quality, quality
-from data_tools.claims.kit.figures import plot_deviations, set_ticks, with_deviation
+from data_tools.claims.kit.figures import plot_deviations, set_ticks, subplots, with_deviation
+from data_tools.claims.kit.tables import mean, spread, table
 from minisplat_ref.extensions.omg.file import OMG_FILE, find_order
 from minisplat_ref.extensions.omg.recipe import POWER, distinct_importance, local_distinctiveness
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED

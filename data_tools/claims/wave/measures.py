@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_tools.claims import kit
-from data_tools.claims.kit.figures import show, table_of
+from data_tools.claims.kit.figures import show, subplots, table_of
 from minisplat_ref.extensions.wave import blending
 from minisplat_ref.extensions.wave.blending import Scene, front_to_back
 from minisplat_ref.extensions.wave.model import (

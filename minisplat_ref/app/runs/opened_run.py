@@ -97,7 +97,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     run = Run(
         folder,
         settings,
-        as_trained(recipe, saved.model),
+        match_calibrations(recipe, saved.model),
         find_owner(settings),
         photographs._replace(train_views=number_views(photographs.train_views)),
         saved.model,

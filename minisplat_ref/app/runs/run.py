@@ -31,8 +31,9 @@ from minisplat_ref.rendering.backends import get_backend
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import last_step, train
-from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
-from minisplat_ref.training.schedule import Recipe, as_trained
+from minisplat_ref.training.pace import COOLED, FINER, Decision, pace_to_json
+from minisplat_ref.training.recipe_settings import match_calibrations
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Model, Scene
 
@@ -76,7 +77,7 @@ class Training(NamedTuple):
     def render_settings(self, model: Model) -> RenderSettings:
         """Return the settings with which a model of this training is rendered."""
         conventions, backend = PROFILES[self.settings.profile], get_backend(self.settings.backend)
-        renderer = as_trained(self.recipe, model).renderer
+        renderer = match_calibrations(self.recipe, model).renderer
         return RenderSettings(self.scene.background, conventions, backend, renderer)
 
 

@@ -21,7 +21,7 @@ from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.metrics.lpips import Network
 from minisplat_ref.rendering import Renderer, RenderSettings, Request
 from minisplat_ref.rendering.backends import get_backend
-from minisplat_ref.training.schedule import as_trained
+from minisplat_ref.training.recipe_settings import match_calibrations
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 
@@ -45,7 +45,7 @@ class Trained(NamedTuple):
 
 def choose_renderer(settings: Settings, model: Model) -> Renderer:
     """Return the renderer with which a run renders a model: with the sky that it has been given, too."""
-    return as_trained(configure_recipe(settings), model).renderer
+    return match_calibrations(configure_recipe(settings), model).renderer
 
 
 def choose_render_settings(settings: Settings, model: Model, background: Floats) -> RenderSettings:

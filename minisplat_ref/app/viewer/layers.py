@@ -151,7 +151,7 @@ def render_layer(trained: Trained, camera: Camera, layer: str, time: float = 0.0
     settings = RenderSettings(
         trained.background, PROFILES[trained.profile], get_backend(trained.backend), trained.renderer
     )
-    output, tape = settings.render(trained.model, view_from(camera, time=time), wants)
+    output, tape = settings.render_view(trained.model, view_from(camera, time=time), wants)
     return LAYERS[layer].picture(RenderedView(output, tape, trained.renderer, wants))
 
 

@@ -200,13 +200,13 @@ def render_distanced(
         raise InputError("a file of surfels with distances has no place for gamma and light: render the run's folder")
     g, log_width = model.gaussians, model.shared[LOG_WIDTH]
     opaque = model._replace(gaussians=g._replace(opacity_logits=opacity_logits(g.distances, log_width)))
-    output, tape = shaded.render(opaque, view, request, visibility, mirrors=mirrors)
+    output, tape = shaded.render_reflective(opaque, view, request, visibility, mirrors=mirrors)
     return output, _SDFTape(tape, g.distances, log_width)
 
 
 def render_distanced_vjp(tape: _SDFTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
     """Gradient of :func:`render_distanced`: that of the logits passes to distances and gamma."""
-    v = shaded.render_vjp(tape.shaded, v_image, v_alpha)
+    v = shaded.render_reflective_vjp(tape.shaded, v_image, v_alpha)
     v_logits = v.gaussians.opacity_logits
     v_distances, v_log_width = opacity_logits_vjp(tape.distances, tape.log_width, v_logits)
     gaussians = v.gaussians._replace(opacity_logits=np.zeros_like(v_logits), distances=v_distances)

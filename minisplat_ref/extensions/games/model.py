@@ -25,7 +25,7 @@ from minisplat_ref.mechanisms.meshes.mesh import Mesh, load_mesh
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import SPLATTING, Inputs, RenderGradient, Request, wrap
-from minisplat_ref.strategy.initialization import are_seen, from_means
+from minisplat_ref.strategy.initialization import are_seen, gaussians_from_means
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import During
@@ -183,7 +183,7 @@ def on_faces(mesh: Mesh, scene: Scene, sh_degree: int, rng: np.random.Generator,
     colors = np.full(means.shape, 0.5)
     if len(scene.points):
         colors = scene.point_colors[cKDTree(scene.points).query(means)[1]] / 255.0
-    plain = from_means(means, ((colors - 0.5) / SH_C0).astype(np.float32), sh_degree)
+    plain = gaussians_from_means(means, ((colors - 0.5) / SH_C0).astype(np.float32), sh_degree)
     g = FaceGaussians(
         *plain,
         corner_logits=np.log(np.maximum(pi, np.finfo(np.float32).tiny)),

@@ -28,7 +28,7 @@ from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.methods.gaussian_splatting import clone_and_split
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.strategy.halving import halves as halve
-from minisplat_ref.strategy.initialization import from_means, from_points
+from minisplat_ref.strategy.initialization import gaussians_from_means, gaussians_from_points
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.training.losses import Cotangents, Rendered, photometric
@@ -63,7 +63,7 @@ def stereo(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaus
     """The scene's points, and points between them that stereo finds."""
     found, colors = densify_points(scene)
     degree = int(np.sqrt(gaussians.sh_rest.shape[1] + 1)) - 1
-    return None if len(found) <= N_AXES else from_points(found, colors, degree)
+    return None if len(found) <= N_AXES else gaussians_from_points(found, colors, degree)
 
 
 def box(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussians | None:
@@ -75,7 +75,7 @@ def box(gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Gaussia
         return None
     low, high = np.quantile(gaussians.means.astype(np.float64), [BOX_SHARE, 1 - BOX_SHARE], axis=0)
     means = rng.uniform(low, high, gaussians.means.shape)
-    made = from_means(means, np.zeros_like(gaussians.sh_dc), int(np.sqrt(gaussians.sh_rest.shape[1] + 1)) - 1)
+    made = gaussians_from_means(means, np.zeros_like(gaussians.sh_dc), int(np.sqrt(gaussians.sh_rest.shape[1] + 1)) - 1)
     return made._replace(
         log_scales=np.minimum(made.log_scales, made.log_scales.dtype.type(np.log(LARGEST * scene.extent)))
     )

@@ -17,7 +17,7 @@ from minisplat_ref.extensions.gaustudio.model import RECIPE
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import load_scene, write_image
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.training.schedule import alternatives_of, settings_of
+from minisplat_ref.training.recipe_settings import find_alternatives, settings_of
 
 STAGES = {
     "initialiser": "the Gaussians with which a training begins",

@@ -144,7 +144,7 @@ def insert_consistent(
 
 def photographed(model: Model, view: View, settings: RenderSettings) -> Photographed:
     """Return the smoothed expected depths of a view where it is opaque and not masked, and its photograph."""
-    output, _ = settings.render(model, view, DEPTH, sh_degree=0)
+    output, _ = settings.render_view(model, view, DEPTH, sh_degree=0)
     sums = output.image[..., settings.renderer.channels(DEPTH)["depth"]][..., 0]
     is_surface = output.alpha >= ALPHA_MIN
     if view.mask is not None:

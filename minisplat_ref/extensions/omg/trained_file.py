@@ -256,12 +256,12 @@ def read_training(path: Path) -> tuple[Model, Frame]:
         It is damaged, or of another recipe.
     """
     from minisplat_ref.io.checkpoint import load_checkpoint
-    from minisplat_ref.training.saved_state import read_bundles, read_frame, written_by
+    from minisplat_ref.training.saved_state import read_bundles, read_frame, recorded_recipe
 
     if path.is_dir():
         raise InputError(f"{path} is a folder: give the checkpoint.npz in it")
     arrays, metadata = load_checkpoint(path)
-    recipe, _ = written_by(metadata)
+    recipe, _ = recorded_recipe(metadata)
     if recipe != OMG.name:
         raise InputError(f"{path} was trained by recipe {recipe}, which has no codes: train with --recipe {OMG.name}")
     bundles = read_bundles(path, arrays, OmgGaussians)

@@ -29,7 +29,7 @@ from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.bvh import build
 from minisplat_ref.mechanisms.rays.gradient_checks import trace_stages
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, Tracer
-from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
+from minisplat_ref.mechanisms.rays.renderer import Traced, make_ray_renderer
 from minisplat_ref.mechanisms.rays.traversal import RayTree
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.setting import Setting
@@ -241,7 +241,7 @@ def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
 TRACED = Representation(
     "flat Gaussians in polygons",
     extend=press_flat,
-    renderer=renderer_of(Traced("polygons", make_polygons, make_tracer, spans_vjp)),
+    renderer=make_ray_renderer(Traced("polygons", make_polygons, make_tracer, spans_vjp)),
 )
 
 POLYGONS = GS_ACCEL._replace(name="polygons")

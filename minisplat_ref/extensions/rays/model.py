@@ -24,7 +24,7 @@ from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.bvh import SLACK, build
 from minisplat_ref.mechanisms.rays.gradient_checks import trace_stages
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, Tracer
-from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
+from minisplat_ref.mechanisms.rays.renderer import Traced, make_ray_renderer
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.setting import Setting
@@ -223,7 +223,7 @@ def _shapes_vjp(population: Any, gaussians: Whitened, v_maps: Floats) -> tuple[F
 
 
 TRACED = Representation(
-    "gaussians traced by rays", renderer=renderer_of(Traced("rays", _prepare, make_tracer, _shapes_vjp))
+    "gaussians traced by rays", renderer=make_ray_renderer(Traced("rays", _prepare, make_tracer, _shapes_vjp))
 )
 
 RAYS = GS_ACCEL._replace(name="rays")

@@ -15,7 +15,7 @@ from minisplat_ref.mechanisms.gbuffer.population import (
     first_light,
     with_materials,
 )
-from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render
+from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render_reflective
 from minisplat_ref.mechanisms.gbuffer.training import NORMALS, SHADING_EVENTS, SHADING_RATES
 from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -42,7 +42,13 @@ RECIPE = GS_ACCEL._replace(
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return shading surfel by surfel, and pixel by pixel with occlusion, which replaces the check of the renderer."""
     stage_of = partial(
-        shading_stage, backend, setting, rng, SHADED, render=partial(render, mirrors=True), shaded=lambda tape: tape
+        shading_stage,
+        backend,
+        setting,
+        rng,
+        SHADED,
+        render=partial(render_reflective, mirrors=True),
+        shaded=lambda tape: tape,
     )
     per_surfel = stage_of(PER_SURFEL, fixed=("sh_dc", "sh_rest"))
     return per_surfel._replace(name="render, shaded surfel by surfel"), stage_of(WITH_OCCLUSION)

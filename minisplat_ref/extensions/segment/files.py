@@ -18,7 +18,6 @@ from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.recipe_settings import configure_renderer
 from minisplat_ref.training.representation import nothing_shared
-from minisplat_ref.training.schedule import configure_renderer
 from minisplat_ref.types import Bools, Camera, Ints
 
 COLUMN = "label"

@@ -27,7 +27,7 @@ from minisplat_ref.cpu.compositing.pixel_rows import (
     row_pixels,
 )
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import pack_frame
 from minisplat_ref.extensions.texture_splat.textures import N_CHANNELS, REACH, TexelGradient
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, accumulate, gather, load, reduce_any, reduce_sum, select, store

@@ -302,7 +302,7 @@ def render_textured(
     """
     stage = np.maximum(model.shared[STAGE], PER_PIXEL) if STAGE in model.shared else None
     deferred = model if stage is None else model._replace(shared={**model.shared, STAGE: stage})
-    return shaded.render(deferred, view, request, visibility, mirrors=True, materials=TEXTURES)
+    return shaded.render_reflective(deferred, view, request, visibility, mirrors=True, materials=TEXTURES)
 
 
 def disc_axes(seen: discs.Seen) -> tuple[Floats, Floats]:
@@ -329,7 +329,7 @@ def _parts(tape: discs.BlendTape) -> tuple[slice, slice]:
     return tape.slices["normal"], slice(first, first + N_CHANNELS - 3)
 
 
-TEXTURED = Renderer("textured surfels", render_textured, shaded.render_vjp, shaded.channels)
+TEXTURED = Renderer("textured surfels", render_textured, shaded.render_reflective_vjp, shaded.channels)
 
 TEXTURED_SURFELS = Representation(
     "textured surfels",

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from minisplat_ref.datasets.named_scenes import read_scene
     from minisplat_ref.extensions.textured.recipe import fine_tune, measure, prepare
-    from minisplat_ref.training.representation import floats_of
+    from minisplat_ref.training.representation import count_floats
 
     if not 1 <= args.degree <= DEGREE:
         raise InputError(f"--degree is {args.degree}: give 1, 2 or 3")

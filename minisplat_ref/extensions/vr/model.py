@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.mechanisms.tangent.gradient_checks import renderer_stage
-from minisplat_ref.mechanisms.tangent.renderer import render, render_vjp
+from minisplat_ref.mechanisms.tangent.renderer import render_planes, render_planes_vjp
 from minisplat_ref.methods.gaussian_splatting import FINE_TUNING
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2
 from minisplat_ref.oracle.setting import Setting

@@ -11,12 +11,13 @@ from data_tools.claims.cus import growth as growth_claim
 from data_tools.claims.kit.objects import object_ids
 from measured_claims import measured
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.extensions.cus import maps
-from minisplat_ref.extensions.cus.losses import read_memory
-from minisplat_ref.extensions.cus.population import as_anchors
+from minisplat_ref.extensions.cus.memory import feature_map
+from minisplat_ref.extensions.cus.model import as_anchors
+from minisplat_ref.extensions.cus.recipe import grow_anchors, read_memory
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.schedule import configure
+from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.schedule import does
 from minisplat_ref.types import Model
 from scenes import make_gaussians
 
@@ -52,7 +53,7 @@ def test_the_claim_runs(tmp_path, monkeypatch, capsys):
     small_room = partial(make_scene, n_views=6, width=48, height=40, supersampling=1, n_points=60)
     monkeypatch.setattr(claim, "make_scene", lambda name, **size: small_room(name))
     monkeypatch.setattr(claim, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
-    words = ["cus/floats", "--iterations", "20", "--seeds", "1", "--out", str(tmp_path / "s")]
+    words = ["cus/floats", "--iterations", "5", "--seeds", "1", "--out", str(tmp_path / "s")]
     records = measured(words)["records"]
     names = ["anchors, latent 2", "anchors, latent 3", "own queries, 1", "own queries, 3", "adaptive"]
     assert [r["arm"] for r in records] == names
@@ -66,14 +67,16 @@ def test_the_claim_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_the_claim_of_growing_runs(tmp_path, monkeypatch, capsys):
-    """The threshold is so low that all grows, the points so few that nothing takes long."""
+    """The threshold is so low that all grows, every ten iterations, the points so few that nothing takes long."""
+    recipe = configure(find_recipe("cus"), **SMALL)
+    events = tuple(e._replace(min_gap=10) if does(e, grow_anchors) else e for e in recipe.events)
     monkeypatch.setattr(growth_claim, "POINTS", (90, 40))
     monkeypatch.setattr(growth_claim, "THRESHOLD", 1e-6)
     monkeypatch.setattr(growth_claim, "SIZE", {"n_views": 6, "width": 48, "height": 40, "supersampling": 1})
-    monkeypatch.setattr(claim, "CUS", configure(find_recipe("cus"), **SMALL))
-    monkeypatch.setattr(claim, "ANCHORS", configure(find_recipe("cus"), **SMALL).representation)
+    monkeypatch.setattr(claim, "CUS", recipe._replace(events=events))
+    monkeypatch.setattr(claim, "ANCHORS", recipe.representation)
     monkeypatch.setattr(growth_claim, "LATENT", SMALL["latent"])
-    records = measured(["cus/growth", "--iterations", "230", "--seeds", "1", "--out", str(tmp_path / "s")])["records"]
+    records = measured(["cus/growth", "--iterations", "24", "--seeds", "1", "--out", str(tmp_path / "s")])["records"]
     assert [r["arm"] for r in records] == [
         "90 points, without growing",
         "90 points, with growing",
@@ -107,7 +110,7 @@ def test_the_teacher_by_hand(made, rng):
     """A label's direction, and 0.3 times the projected texture."""
     teacher, view = claim.make_teacher(rng), made.scene.train_views[0]
     labels = object_ids(made.train_ids[0])
-    texture = maps.feature_map(view, "")[5, 7] @ teacher.texture
+    texture = feature_map(view, "")[5, 7] @ teacher.texture
     expected = teacher.directions[labels[5, 7]] + 0.3 * texture
     assert_allclose(teacher.features(view, labels)[5, 7], expected, rtol=1e-5)
     assert_allclose(np.linalg.norm(teacher.directions, axis=1), 1)

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.claims import discretized_sdf as claim
-from minisplat_ref.extensions.discretized_sdf.population import WIDTH
+from minisplat_ref.extensions.discretized_sdf.model import WIDTH
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.types import Model, RenderOutput
 

@@ -5,7 +5,7 @@ import pytest
 
 from data_tools.claims.fans.profile import fan_profile, mass, profile_error
 from measured_claims import measured, scene_folder  # noqa: F401  (a fixture)
-from minisplat_ref.extensions.fans.shapes import FanShape
+from minisplat_ref.extensions.fans.model import FanShape
 from minisplat_ref.io.ply import save_ply
 from scenes import as_dtype, make_gaussians
 from tolerances import PROFILE_GRID

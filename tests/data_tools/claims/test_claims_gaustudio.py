@@ -7,8 +7,8 @@ from data_tools.claims import gaustudio as claim
 from data_tools.claims.__main__ import main as measure_claim
 from measured_claims import measured
 from minisplat_ref.app.cli import main
-from minisplat_ref.extensions.gaustudio import modules
-from minisplat_ref.extensions.gaustudio.modules import STAGES
+from minisplat_ref.extensions.gaustudio import commands
+from minisplat_ref.extensions.gaustudio.commands import STAGES
 
 TINY = ("--views", "9", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 
@@ -38,7 +38,7 @@ def test_the_claim_of_swaps(folder, tmp_path, capsys):
     assert [record["arm"] for record in records] == ["as it is", "photo_loss=l1", "photo_loss=squared"]
     assert set(claim.SWAPPED) == STAGES.keys() - {"sky_mask"}
     assert len(claim.swaps(claim.SWAPPED)) == 1 + sum(
-        len(stage.modules) - 1 for stage in modules.all_stages() if stage.name != "sky_mask"
+        len(stage.modules) - 1 for stage in commands.all_stages() if stage.name != "sky_mask"
     )
     assert (
         measure_claim(["gaustudio/swaps", str(folder / "scene"), "--stages", "sky", "--out", str(tmp_path / "y")]) == 2

@@ -11,7 +11,7 @@ from measured_claims import measured
 from minisplat_ref import load_ply, load_scene, save_ply
 from minisplat_ref.extensions.omg import file as omg
 from minisplat_ref.extensions.omg import trained_file
-from minisplat_ref.extensions.omg.pack import read_training
+from minisplat_ref.extensions.omg.trained_file import read_training
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.initial_state import initial_state

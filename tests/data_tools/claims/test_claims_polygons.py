@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from data_tools.claims.__main__ import main as measure_claim
 from data_tools.claims.polygons import edits as claims
 from measured_claims import measured
-from minisplat_ref.extensions.polygons.soup import carry_gaussians, soup_of
+from minisplat_ref.extensions.polygons.soup import carry_gaussians, make_soup
 from minisplat_ref.mechanisms.meshes.fans import flatten
 from scenes import make_gaussians
 from tolerances import AFFINE_EDIT, EDITED_IMAGE, PARITY_FLOAT64
@@ -36,7 +36,7 @@ def is_same(a, b):
 @pytest.mark.parametrize("n_sides", [3, 8])
 def test_an_affine_edit_is_the_gaussians_transformed(name, n_sides, rng):
     before, A = model(rng), claims.MAPS[name]
-    soup = soup_of(before, n_sides)
+    soup = make_soup(before, n_sides)
     after, n = carry_gaussians(before, soup, soup.corners @ A.T + SHIFT, "it")
     assert n == 28
     direct = planar(before)[soup.rows]
@@ -45,7 +45,7 @@ def test_an_affine_edit_is_the_gaussians_transformed(name, n_sides, rng):
     assert_allclose(after.means[soup.rows], before.means[soup.rows] @ A.T + SHIFT, atol=AFFINE_EDIT)
     assert_allclose(planar(after)[soup.rows] / scale, expected / scale, atol=AFFINE_EDIT)
     assert is_same([f[[3, 7]] for f in after], [f[[3, 7]] for f in before])
-    again = soup_of(after, n_sides)
+    again = make_soup(after, n_sides)
     if name in ("turn", "turn and scale"):  # elsewhere the axes of the ellipse lie at other corners
         assert_allclose(again.corners, soup.corners @ A.T + SHIFT, atol=AFFINE_EDIT)
 

@@ -9,7 +9,7 @@ from data_tools.claims.vr import queues
 from minisplat_ref.constants import EXACT_ORDER
 from minisplat_ref.extensions.vr.foveation import eccentricities
 from minisplat_ref.mechanisms.orders import blending_order
-from minisplat_ref.mechanisms.tangent.renderer import prepare, render
+from minisplat_ref.mechanisms.tangent.renderer import prepare, render_planes
 from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.types import Model, view_from
@@ -92,7 +92,7 @@ def test_the_exact_order_draws_what_the_renderer_draws(rng):
     n_listed = len(prepare(model, camera, REQUEST, None).listed().gaussian_ids)
     assert named["list by depth in the tile"][1].n_depths == n_listed  # one for each Gaussian of each tile
     for name, buffer_size in (("exact order", None), ("buffer of 16 per pixel", 16)):
-        expected = render(model, view_from(camera), REQUEST, buffer_size=buffer_size)[0].image
+        expected = render_planes(model, view_from(camera), REQUEST, buffer_size=buffer_size)[0].image
         assert_allclose(named[name][0], expected, atol=1e-12)
     wrong = [work.n_wrong for work in works]
     by_z, _, by_tile, hierarchy, *_, exact = wrong
