@@ -15,13 +15,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import cache_root, source_hash
 
 _HASH = re.compile("[0-9a-f]{16}")  # Numba's own folders have longer names
-_KERNEL_FILES = (
-    "lock",
-    "*.lock",
-    "*.nbi",
-    "*.nbc",
-    "*.tmp.*",
-)  # locks, index, code, and code that was being written in a crash
+_KERNEL_FILES = ("lock", "*.lock", "*.nbi", "*.nbc", "*.tmp.*")  # locks, index, code, code half written in a crash
 
 
 class KernelFolder(NamedTuple):

@@ -34,6 +34,7 @@ SCALE_MIN = 1e-3  # of the residuals, as rounding to 8 bits leaves about this mu
 MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 OBSERVATIONS_MIN = 20  # fewer do not determine the gain of a photograph
 SPREAD_MIN = 0.02  # standard deviation of the log gains; 0.013 is the largest of synthetic scenes without any
+OUTLIER = 3.0  # robust standard deviations
 FALL_MIN = 0.01  # relative, of the residual of points that were not fitted
 
 
@@ -75,11 +76,21 @@ class TrackGains(NamedTuple):
         differs = self.spread > max(SPREAD_MIN, 3 * self.error)
         return differs and self.residual_with_gains < (1 - FALL_MIN) * self.residual
 
+    @property
+    def outliers(self) -> Ints:
+        """Photographs whose mean log gain is more than ``OUTLIER`` robust standard deviations from the median."""
+        rows = np.flatnonzero(self.is_known)
+        g = self.log_gains[rows].mean(axis=1)
+        distances = np.abs(g - np.median(g)) if len(g) else g
+        return rows[distances > max(OUTLIER * _scale(distances), SPREAD_MIN)] if len(g) else rows
+
     def describe(self) -> str:
-        """Return one sentence without a full stop."""
+        """Return half a sentence that begins with a verb."""
+        if not self.is_known.any():
+            return "are not known: no photograph has enough tracks of sparse points"
         return (
-            f"exposures differ by {self.spread:.1%} (error {self.error:.1%}); points that were not fitted differ by"
-            f" {self.residual:.1%} from photograph to photograph, by {self.residual_with_gains:.1%} with gains"
+            f"differ by {self.spread:.1%} (error {self.error:.1%}): a point's colour varies by {self.residual:.1%} from"
+            f" photograph to photograph, and by {self.residual_with_gains:.1%} after division by them"
         )
 
 

@@ -173,6 +173,16 @@ def test_a_photograph_with_few_points_keeps_its_exposure(room):
     assert not found.log_gains[0].any()
 
 
+def test_photographs_far_from_the_others_are_named():
+    """Gains of 0, 0.01, -0.01, 0.02, -0.02 and 0.1: the median is 0.005, the median distance 0.015, 3 sigma 0.067."""
+    log_gains = np.array([0.0, 0.01, -0.01, 0.02, -0.02, 0.1, 0.9])[:, None] * np.ones(3)
+    is_known = np.array([True] * 6 + [False])
+    gains = TrackGains(log_gains, is_known, np.zeros((0, 3)), 0.0, 0.0, 0.0)
+    assert list(gains.outliers) == [5]
+    nothing = gains._replace(is_known=np.zeros(7, bool))
+    assert len(nothing.outliers) == 0 and "not known" in nothing.describe()
+
+
 @pytest.mark.parametrize(
     ("spread", "error", "with_gains", "expected"),
     [
