@@ -142,6 +142,7 @@ def main() -> None:
     with TemporaryDirectory() as folder, use_db(session) as db:
         os.chdir(copy_tree(Path(folder)))
         os.environ["PYTHONPATH"] = os.getcwd()
+        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # a change of the same length in the same second would not be read
         settings = load_config(SETTINGS)
         every = sorted(find_modules(map(Path, settings["module-path"])))
         if db.num_work_items == 0:

@@ -82,6 +82,7 @@ def outcomes(changes: Sequence[Change], seconds: int) -> Iterator[tuple[Change, 
     with TemporaryDirectory() as folder:
         os.chdir(copy_tree(Path(folder)))
         os.environ["PYTHONPATH"] = os.getcwd()
+        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # a change of the same length in the same second would not be read
         imports = Imports(sorted(Path("minisplat_ref").rglob("*.py")), sorted(Path("tests").rglob("test_*.py")))
         try:
             for path, own in groupby(changes, key=lambda change: change.path):

@@ -40,18 +40,21 @@ def recipe_options() -> dict[str, list[str]]:
     return options
 
 
-def run(tree: Path, *arguments: str) -> None:
-    """Run a command of the package as it is in a tree; an exit code of 1 is a check's verdict, and compared."""
+def run(tree: Path, *arguments: str) -> int:
+    """Run a command of the package in a tree; return its exit code, where 1 is a check's verdict, and 2 a refusal."""
     command = [sys.executable, "-m", "minisplat_ref", *arguments]
     environment = os.environ | {"PYTHONPATH": str(tree)}
     done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode not in (0, 1):
+    if done.returncode not in (0, 1, 2):
         raise RuntimeError(f"{' '.join(command)} in {tree} ended with {done.returncode}:\n{done.stderr}")
+    return done.returncode
 
 
 def train(tree: Path, scene: Path, options: list[str], out: Path, iterations: int) -> dict[str, Any]:
-    """Train, and return what must not change."""
-    run(tree, "train", str(scene), *options, "--iterations", str(iterations), "--seed", "0", "--out", str(out))
+    """Train, and return what must not change; of a recipe that needs more than a scene, that it is refused."""
+    words = ("train", str(scene), *options, "--iterations", str(iterations), "--seed", "0", "--out", str(out))
+    if run(tree, *words) == 2:
+        return {"is_refused": True}
     metrics = json.loads((out / "metrics.json").read_text())
     bytes_of_model = (out / "point_cloud.ply").read_bytes()
     return {"sha256": hashlib.sha256(bytes_of_model).hexdigest()[:16], "psnr": metrics["psnr"], "ssim": metrics["ssim"]}
@@ -69,6 +72,15 @@ def figures_of(value: Any) -> Any:
         kept = {k: v for k, v in value.items() if not TIMES & set(re.findall(r"[a-z]+", k.lower()))}
         return {k: figures_of(v) for k, v in kept.items() if not isinstance(v, str)}
     return [figures_of(item) for item in value if not isinstance(item, str)] if isinstance(value, list) else value
+
+
+def describe(result: Any) -> str:
+    """Return a result in few words."""
+    if isinstance(result, dict) and "is_refused" in result:
+        return "needs more than a scene"
+    return (
+        f"{result['psnr']:.3f} dB, {result['sha256']}" if isinstance(result, dict) and "sha256" in result else "figures"
+    )
 
 
 def main() -> None:
@@ -97,7 +109,7 @@ def main() -> None:
         for what, calls in tasks.items():
             before, now = both.map(lambda call: call(), calls)
             n_different += before != now
-            shown = f"{now['psnr']:.3f} dB, {now['sha256']}" if isinstance(now, dict) and "sha256" in now else "figures"
+            shown = describe(now)
             rows.append([what, shown, "same" if before == now else "DIFFERENT"])
             print(*rows[-1], sep="\t", file=sys.stderr, flush=True)
     print(markdown_table(["what", "now", "compared"], rows))

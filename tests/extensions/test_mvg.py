@@ -214,7 +214,7 @@ def test_depths_are_of_opaque_pixels_that_the_mask_keeps():
         renderer, conventions = SURFELS, GSPLAT_MAIN
 
         @staticmethod
-        def render(model, view, wants, sh_degree):
+        def render_view(model, view, wants, sh_degree):
             return RenderOutput(image, alpha, None, None), None
 
     view = View("v", camera, np.full((1, 3, 3), 51, np.uint8), np.array([[True, True, False]]))

@@ -88,7 +88,7 @@ def consistency(monkeypatch, plateau, shift, change=lambda image: image):
     view = view_from(boxes.zenith(24))
     output, _ = SATELLITE.render(model, view, request)
     changed = output._replace(image=change(output.image))
-    monkeypatch.setattr("minisplat_ref.extensions.satellite.losses.make_shear", lambda *_: shift)
+    monkeypatch.setattr("minisplat_ref.extensions.satellite.recipe.make_shear", lambda *_: shift)
     rendered = Rendered(changed, CHANNELS, view, scene, model, 1, request)
     return view_consistency(rendered, altitude=0.01, color=0.1, noise=0.0, limit=1.0)[0]
 

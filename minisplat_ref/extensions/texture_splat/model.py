@@ -296,7 +296,7 @@ TEXTURES = shaded.Materials(read_textures, read_textures_vjp, blend, blend_vjp)
 def render_textured(
     model: Model, view: View, request: Request, visibility: Floats | None = None
 ) -> tuple[RenderOutput, shaded.ReflectiveTape]:
-    """Render a view; see :func:`minisplat_ref.mechanisms.gbuffer.renderer.render`.
+    """Render a view; see :func:`minisplat_ref.mechanisms.gbuffer.renderer.render_reflective`.
 
     Textures are shaded pixel by pixel, whatever stage the model has. The channel ``normal`` is that of the textures.
     """

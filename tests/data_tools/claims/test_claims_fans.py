@@ -33,8 +33,8 @@ def test_the_claims(scene_folder, model, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("data_tools.claims.fans.measures.REACHES", (2.5,))
     monkeypatch.setattr("data_tools.claims.fans.measures.SIDES", (4, 8))
     monkeypatch.setattr("data_tools.claims.fans.measures.VIEWS_MAX", 1)
-    monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.EVALUATIONS", 4)
-    monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.FIRST_REACHES", (2.5,))
+    monkeypatch.setattr("data_tools.claims.fans.shape_search.EVALUATIONS", 4)
+    monkeypatch.setattr("data_tools.claims.fans.shape_search.FIRST_REACHES", (2.5,))
     monkeypatch.setattr("data_tools.claims.fans.profile.ANGLES", (0, 90))
     refit, profile = tmp_path / "refit", tmp_path / "profile"
     options = ["--ply", str(model), "--fine-tune", "3", "--out", str(refit)]

@@ -30,7 +30,7 @@ def test_the_claim_measures_the_truth_as_it_is(monkeypatch):
         image = np.concatenate([np.zeros((*depth.shape, 3)), (1.02 * alpha * depth)[..., None]], axis=2)
         return RenderOutput(image if wants else image[..., :3], alpha, None, None), None
 
-    monkeypatch.setattr("minisplat_ref.rendering.RenderSettings.render", render)
+    monkeypatch.setattr("minisplat_ref.rendering.RenderSettings.render_view", render)
     found = outcome(made, 1, "surfels without", 0)
     assert found["depth_error"] == pytest.approx(2.0, abs=1e-6) and found["normal_error"] < 1
 

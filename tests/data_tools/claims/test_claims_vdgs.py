@@ -30,7 +30,7 @@ def test_the_pane(tmp_path):
 
 
 def test_equal_floats(monkeypatch, scene):
-    monkeypatch.setattr("minisplat_ref.extensions.vdgs.method.N_ROWS", 16)
+    monkeypatch.setattr("minisplat_ref.extensions.vdgs.model.N_ROWS", 16)
     recipe = floats_claim.arms(3)["colors_plus"]
     assert floats_claim.n_shared(scene, recipe) == 4 * 16 * 2 + 11 * 32 + 32 + 32 * 48 + 48 + 4
     ours, theirs = (floats_claim.measure(scene, 3, 50, arm, 0) for arm in ("colors_plus", floats_claim.HARMONICS))
