@@ -1,11 +1,13 @@
 """Depth reinitialisation: where pixels have their points, which are drawn, and what other views say about them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref import memory
-from minisplat_ref.constants import INRIA
+from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import get_recipe
@@ -22,7 +24,7 @@ from minisplat_ref.strategy.depth_reinit import (
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import concat
 from minisplat_ref.training.loop import train
-from minisplat_ref.types import Gaussians, View, view_from
+from minisplat_ref.types import Camera, Gaussians, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64, SAMPLED_SHARE
 
@@ -119,6 +121,21 @@ def test_principal_point_is_the_conventions(points_of, rng):
         strict=True,
     ):
         assert_array_equal(of_moved, of_centred)
+
+
+def test_points_on_rays_by_hand():
+    """Pixel (1, 0) at depth 2, with f = (4, 1) and the middle in (1, 0.5), is at 2 (0.5 / 4, 0, 1) = (1/4, 0, 2).
+
+    The camera looks along world x, and x - t = (-3/4, 2, 2) is (2, -3/4, 2) in the world. Pixel (0, 0) shows nothing.
+    """
+    looks_along_x = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    camera = Camera(looks_along_x, np.array([1.0, -2, 0]), 4.0, 1.0, 1.0, 0.5, 2, 1)
+    output = SimpleNamespace(extras={"dominant_depth": np.array([[0.0, 2.0]])}, alpha=np.array([[0.3, 0.4]]))
+    settings = SimpleNamespace(render_view=lambda *_, **__: (output, None), conventions=GSPLAT_MAIN)
+    points, depths, alpha = centre_points(None, view_from(camera), settings)
+    assert_allclose(points, [[[0, 0, 0], [2, -0.75, 2]]], atol=CLOSED_FORM)
+    assert_array_equal(depths, [[0.0, 2.0]])
+    assert_array_equal(alpha, [[0.3, 0.4]])
 
 
 # Which pixels are drawn -----------------------------------------------------------------------------------------------

@@ -209,6 +209,21 @@ def test_nearest_merge_first():
     assert_array_equal(np.flatnonzero(merge_neighbours(gaussians, np.ones(8), 5).is_new), [1, 2, 3])
 
 
+def test_only_the_cheaper_half_of_the_pairs_merges_in_a_round():
+    """Gaps of 1 and 2 cost 1 / 2 and 4 / 2; only the first closes, and then its middle is 1.7 from a third one.
+
+    That costs 1.7^2 * 2 / 3 = 1.93, less than the gap of 2, which stays open.
+    """
+    gaussians = on_a_line(np.array([0.0, 1, 2.2, 10, 12]))
+    assert_array_equal(merge_neighbours(gaussians, np.ones(5), 3).is_new, [True, False, False])
+
+
+def test_the_half_of_three_pairs_is_two():
+    """Gaps of 1, 1.8 and 3 cost 0.5, 1.62 and 4.5; a third one 1.55 from the middle of the first would cost 1.60."""
+    gaussians = on_a_line(np.array([0.0, 1, 2.05, 20, 21.8, 40, 43]))
+    assert_array_equal(merge_neighbours(gaussians, np.ones(7), 5).is_new, [True, False, True, False, False])
+
+
 def test_unimportant_ones_merge_first():
     """Ward: 1 * 1 / 2 for the gap of 1, against 4 * 0.1 / 1.1 for that of 2."""
     gaussians = on_a_line(np.array([0.0, 1, 10, 12]))

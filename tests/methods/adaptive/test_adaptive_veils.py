@@ -6,6 +6,7 @@ import pytest
 from minisplat_ref.methods.adaptive import veils
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.strategy.line_of_sight import SightLines
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.recipe_settings import settings_of
 from minisplat_ref.training.schedule import does
@@ -102,3 +103,79 @@ def test_adaptive_does_it_every_hundred_iterations():
     assert [step for step in range(1, 401) if event.is_due(step)] == [200, 300, 400]
     settings = settings_of(ADAPTIVE)
     assert {name: settings[name] for name in SETTINGS} == SETTINGS
+
+
+def test_more_than_half_of_the_weight_and_a_tenth_of_a_pixel(monkeypatch):
+    """Of all weight 1 / 2 stays and 0.51 goes; of what is wholly before points 0.1 goes and 0.099 stays."""
+    model = gaussians([[i, 0, 9] for i in range(6)], [0.5] * 6)
+    before, all_ = np.array([0.5, 0.51, 0.099, 0.1, 0.0, 3.0]), np.array([1.0, 1.0, 0.099, 0.1, 0.0, 6.1])
+    monkeypatch.setattr(veils, "weigh_sight_lines", lambda *_: (before, all_))
+    state, iteration = setting(model)
+    assert veils.remove_veils(state, iteration, **SETTINGS).startswith("2 stood")
+    assert list(state.gaussians.means[:, 0]) == [0, 2, 4, 5]
+
+
+@pytest.mark.parametrize(("step", "n_left"), [(499, 2), (500, 2), (501, 1)])
+def test_nothing_goes_until_the_start(step, n_left):
+    state, iteration = setting(gaussians([[0, 0, 2], [0, 0, 5]], [0.4, 0.9]), step=step)
+    veils.remove_veils(state, iteration, **SETTINGS)
+    assert len(state.gaussians.means) == n_left
+
+
+@pytest.mark.parametrize(("depth", "is_before"), [(4.49, True), (4.51, False)])
+def test_a_tenth_of_the_depth_belongs_to_the_surface(depth, is_before):
+    """The point is at depth 5."""
+    before, all_ = veils.weigh_sight_lines(*setting(gaussians([[0, 0, depth]], [0.4])))
+    assert all_[0] == pytest.approx(0.4, rel=1e-4)
+    assert before[0] == (all_[0] if is_before else 0)
+
+
+def test_weights_add_up_over_rays_and_views(monkeypatch):
+    """Two views with the same lines: twice 0.25 + 0.5 of Gaussian 0, of which 0.5 is before, and twice 1 of 2."""
+    lines = SightLines(
+        np.array([0, 0, 2]), np.array([0, 1, 1]), np.array([0.25, 0.5, 1.0]), np.array([False, True, False]), None
+    )
+    monkeypatch.setattr(veils, "trace_sight_lines", lambda *_: lines)
+    before, all_ = veils.weigh_sight_lines(*setting(gaussians([[0, 0, 9]] * 4, [0.4] * 4), n_views=2))
+    np.testing.assert_array_equal(before, [1.0, 0, 0, 0])
+    np.testing.assert_array_equal(all_, [1.5, 0, 2.0, 0])
+
+
+@pytest.mark.parametrize(
+    ("n", "step", "expected"),
+    [
+        (8, 700, range(8)),
+        (9, 600, range(0, 9, 2)),
+        (9, 700, range(1, 9, 2)),
+        (16, 799, range(1, 16, 2)),
+        (17, 800, range(2, 17, 3)),
+        (17, 900, range(0, 17, 3)),
+    ],
+)
+def test_eight_views_at_most_evenly_spread(monkeypatch, n, step, expected):
+    """Of 9 every second, of 17 every third; which is the first changes every 100 iterations, and begins again.
+
+    Views without tracks, of which there is one before each other, do not count.
+    """
+    lines = SightLines(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0, bool), np.zeros(0))
+    seen = []
+    monkeypatch.setattr(veils, "trace_sight_lines", lambda _, view, *__: seen.append(int(view.name)) or lines)
+    state, iteration = setting(gaussians([[0, 0, 9]], [0.4]), n_views=n, step=step)
+    untracked = view_from(CAMERA, name="-1")
+    views = [view for tracked in iteration.scene.train_views for view in (untracked, tracked)]
+    veils.weigh_sight_lines(state, iteration._replace(scene=iteration.scene._replace(train_views=views)))
+    assert seen == list(expected)
+
+
+@pytest.mark.parametrize(
+    ("n", "step", "expected"),
+    [(256, 700, range(256)), (257, 700, range(1, 257, 2)), (513, 800, range(2, 513, 3)), (513, 900, range(0, 513, 3))],
+)
+def test_256_rays_of_a_view_at_most_evenly_spread(monkeypatch, n, step, expected):
+    lines = SightLines(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0, bool), np.zeros(0))
+    seen = []
+    monkeypatch.setattr(veils, "trace_sight_lines", lambda _, view, *__: seen.extend(view.point_ids) or lines)
+    state, iteration = setting(gaussians([[0, 0, 9]], [0.4]), step=step)
+    views = [iteration.scene.train_views[0]._replace(point_ids=np.arange(n))]
+    veils.weigh_sight_lines(state, iteration._replace(scene=iteration.scene._replace(train_views=views)))
+    assert seen == list(expected)
