@@ -36,7 +36,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import IO, Any
@@ -68,6 +68,8 @@ if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 _KERNEL_LOCK = threading.RLock()
+PATIENCE = 60.0
+"""Seconds that a process waits for another one to compile a kernel; that one may have been suspended."""
 _COMPILING = ExitStack()  # contains the lock of the kernel that is being compiled; guarded by the lock of all kernels
 _PACKAGE = Path(__file__).parent.parent
 _PARALLEL = {  # only loops over prange, in their order, and nothing that Numba parallelises on its own
@@ -227,20 +229,24 @@ def _lock(file: IO[bytes]) -> bool:
 
 
 def _share_work(compiled: Any, folder: str) -> None:
-    """Let one process compile a kernel, for which others wait, and save it under the lock of the cache."""
+    """Let one process compile a kernel, for which others wait, and save it under the lock of the cache.
+
+    A kernel that cannot be saved, as on a full disk, is used all the same; the next process compiles it again.
+    """
     load, save = compiled._cache.load_overload, compiled._cache.save_overload
 
     def load_overload(signature: Any, context: Any) -> Any:
         found = load(signature, context)
         if found is None:
-            _COMPILING.enter_context(_one_process_at_a_time(folder, f"{compiled._cache._impl.filename_base}.lock", 60))
+            name = f"{compiled._cache._impl.filename_base}.lock"
+            with suppress(OSError):  # without a lock, two processes may do the same work
+                _COMPILING.enter_context(_one_process_at_a_time(folder, name, PATIENCE))
             found = load(signature, context)  # another process may just have saved it
         return found
 
     def save_overload(signature: Any, result: Any) -> None:
-        with _one_process_at_a_time(folder):
+        with _COMPILING, suppress(OSError), _one_process_at_a_time(folder):
             save(signature, result)
-        _COMPILING.close()
 
     compiled._cache.load_overload = load_overload
     compiled._cache.save_overload = save_overload

@@ -1,5 +1,6 @@
 """How kernels are run must not show in what they return: dtype, threads, compiled or not, fresh or from the cache."""
 
+import errno
 import gc
 import os
 import shutil
@@ -246,6 +247,29 @@ def test_a_kernel_that_another_process_compiles_is_awaited_and_loaded(tmp_path, 
         assert len(compiled) == 1
         ours(values)
         assert len(compiled) == 1 and (values == 4).all()
+
+
+@pytest.mark.parametrize("refused", ["lock", "kernel"])
+def test_a_kernel_that_cannot_be_saved_is_used_all_the_same(refused, tmp_path, monkeypatch):
+    """A disk that is full, before a lock of no bytes or before the kernel."""
+    monkeypatch.setattr(_jit, "cache_folder", lambda function: str(tmp_path))
+
+    def no_space(*of, **named):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if refused == "lock":
+        monkeypatch.setattr(_jit, "_one_process_at_a_time", no_space)
+    else:
+        monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", no_space)
+
+    @_jit.kernel(parallel=False)
+    def doubled(values):
+        for i in range(values.size):
+            values[i] *= 2
+
+    values = np.ones(3)
+    doubled(values)
+    assert (values == 2).all() and not list(tmp_path.rglob("*.nbc"))
 
 
 def test_a_suspended_process_holds_nobody_up_for_ever(tmp_path):
