@@ -27,15 +27,15 @@ from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.types import Bools, Floats, Ints, Scene, View
 
 REACH = 1  # pixels around an observation over which its colour is averaged
-DARK, BRIGHT = 8, 247  # of 255: an observation with a pixel beyond them is left out
+DARK, BRIGHT = 8, 247  # of 255, ours: an observation with a pixel beyond them is left out
 N_ROUNDS = 30  # of reweighting, at most
 CONVERGED = 1e-6  # change of a log gain that ends the rounds
 SCALE_MIN = 1e-3  # of the residuals, as rounding to 8 bits leaves about this much
 MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-OBSERVATIONS_MIN = 20  # fewer do not determine the gain of a photograph
-SPREAD_MIN = 0.02  # standard deviation of the log gains; 0.013 is the largest of synthetic scenes without any
-OUTLIER = 3.0  # robust standard deviations
-FALL_MIN = 0.01  # relative, of the residual of points that were not fitted
+OBSERVATIONS_MIN = 20  # ours: fewer do not determine the gain of a photograph
+SPREAD_MIN = 0.02  # standard deviation of the log gains, ours: smaller ones are hardly visible
+OUTLIER = 3.0  # robust standard deviations, ours
+FALL_MIN = 0.01  # relative, of the residual of points that were not fitted; ours
 
 
 class Observations(NamedTuple):

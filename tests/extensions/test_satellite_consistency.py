@@ -8,15 +8,13 @@ from numpy.testing import assert_allclose
 
 from data_tools.claims.satellite import boxes
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite import cameras
-from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.model import SATELLITE
 from minisplat_ref.extensions.satellite.recipe import make_shear, view_consistency
 from minisplat_ref.rendering import Request
-from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
-from minisplat_ref.types import Model, view_from
-from scenes import as_dtype
+from minisplat_ref.types import view_from
+from plateau import plateau  # noqa: F401  (a fixture)
 from tolerances import CLOSED_FORM
 
 # --- cameras ---
@@ -58,25 +56,6 @@ def test_a_shear_is_of_the_size_of_the_image():
     twice = np.array([make_shear(rendered_of(2 * high, camera, step), 0.1) for step in range(5)])
     assert_allclose(twice, shears[:5] / 2, rtol=CLOSED_FORM)
     assert make_shear(rendered_of(high, camera, 3), 0.1) == make_shear(rendered_of(high, camera, 3), 0.1)
-
-
-@pytest.fixture(scope="module")
-def plateau():
-    """An opaque, textured plane at 6 m of altitude, so that a shear moves what is seen, and changes nothing of it."""
-    truth = boxes.make_scene(0, n_points=4, size=16)
-    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
-    places = np.stack(np.meshgrid(*[np.linspace(-2, 2, 61)] * 2), axis=-1).reshape(-1, 2)
-    n = len(places)
-    waves = np.sin(3 * places[:, :1] + [0, 1, 2]) + np.cos(4 * places[:, 1:] + [0, 1, 2])
-    g = as_dtype(state.gaussians, np.float64)._replace(
-        means=np.column_stack([places, np.full(n, 6 / boxes.SCALE)]),
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        log_scales=np.log(np.tile([0.05, 0.05, 1e-4], (n, 1))),
-        opacity_logits=np.full(n, 6.0),
-        sh_dc=0.3 * waves,
-        sh_rest=np.zeros((n, 0, 3)),
-    )
-    return Model(g, {RADIOMETRY: np.eye(3, 4)[None], IN_SHADOW: np.full((1, 3), 0.05)}), truth.scene
 
 
 CHANNELS = {"albedo": slice(3, 6), "altitude": slice(6, 7)}

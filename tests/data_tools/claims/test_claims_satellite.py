@@ -15,6 +15,7 @@ from minisplat_ref.extensions.satellite.commands import surface_model
 from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.types import Model
+from plateau import plateau  # noqa: F401  (a fixture)
 from scenes import as_dtype
 from tolerances import CLOSED_FORM
 
@@ -34,25 +35,6 @@ def test_what_is_high_is_seen_beside():
 
 
 # --- consistency of views ---
-
-
-@pytest.fixture(scope="module")
-def plateau():
-    """An opaque, textured plane at 6 m of altitude, so that a shear moves what is seen, and changes nothing of it."""
-    truth = boxes.make_scene(0, n_points=4, size=16)
-    state = initial_state(truth.scene, find_recipe("satellite", 10), 0)
-    places = np.stack(np.meshgrid(*[np.linspace(-2, 2, 61)] * 2), axis=-1).reshape(-1, 2)
-    n = len(places)
-    waves = np.sin(3 * places[:, :1] + [0, 1, 2]) + np.cos(4 * places[:, 1:] + [0, 1, 2])
-    g = as_dtype(state.gaussians, np.float64)._replace(
-        means=np.column_stack([places, np.full(n, 6 / boxes.SCALE)]),
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        log_scales=np.log(np.tile([0.05, 0.05, 1e-4], (n, 1))),
-        opacity_logits=np.full(n, 6.0),
-        sh_dc=0.3 * waves,
-        sh_rest=np.zeros((n, 0, 3)),
-    )
-    return Model(g, {RADIOMETRY: np.eye(3, 4)[None], IN_SHADOW: np.full((1, 3), 0.05)}), truth.scene
 
 
 def terms_of(recipe):

@@ -1,40 +1,13 @@
 """Waves: closed forms, screens and focus, and small runs of both claims."""
 
-import json
-
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from data_tools.claims.wave import measures as claims
 from measured_claims import measured
-from minisplat_ref.io import viewpoints
 from minisplat_ref.io.images import read_image
-from minisplat_ref.io.label import Label
-from minisplat_ref.io.ply import save_ply
-from minisplat_ref.io.viewpoints import Viewpoint
-from minisplat_ref.types import Camera
-from scenes import as_dtype, make_gaussians
 from tolerances import WAVE_BRUTE_FORCE, WAVE_SCREEN
-
-CAMERA = Camera(np.eye(3), np.zeros(3), 48.0, 48.0, 24.0, 16.0, 48, 32)
-
-SURFELS = Label("surfels")
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run's folder with a few flat Gaussians, two cameras that see them and one that does not."""
-    folder = tmp_path_factory.mktemp("wave")
-    g = make_gaussians(np.random.default_rng(3), 40, size=0.1, opacity_logit=2.0)
-    g.log_scales[:, 2] = -12
-    save_ply(folder / "point_cloud.ply", as_dtype(g, np.float32), SURFELS)
-    away = CAMERA._replace(cam_from_world_R=np.diag([-1.0, 1.0, -1.0]))
-    beside = CAMERA._replace(cam_from_world_t=np.array([0.2, 0.0, 0.0]))
-    named = [("beside", beside, "train"), ("test", CAMERA, "test"), ("away", away, "train")]
-    views = [Viewpoint(name, camera, split) for name, camera, split in named]
-    (folder / "cameras.json").write_text(json.dumps(viewpoints.to_json(views)))
-    return folder
+from wave_run import run  # noqa: F401  (a fixture)
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 45])
