@@ -107,6 +107,9 @@ class View(NamedTuple):
     trained on."""
     time: float = 0.0
     """When it was taken, in the scene's own unit, usually from 0 to 1; for scenes that move."""
+    log_gain: Floats | None = None
+    """[3] natural logarithm of its exposure over the mean of the training photographs, in sRGB, from
+    :func:`minisplat_ref.strategy.track_gains.store_gains`; None where it is not known, or where they do not differ."""
 
     def __repr__(self) -> str:
         return one_line(self)

@@ -52,7 +52,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARM
     result = {}
     for arm in kit.with_progress(arms, "trainings"):
         photographed, truth = (scene, identities) if arm == "undisturbed" else (disturbed, maps)
-        state = train(photographed, configure(recipe, exposure=arm == "calibrated"), seed=seed)
+        state = train(photographed, configure(recipe, exposure="learned" if arm == "calibrated" else "none"), seed=seed)
         exposures = state.shared.get(EXPOSURES, identities)
         K = common_map(exposures, truth)
         recovered = compose(exposures, K)

@@ -2,9 +2,9 @@
 
 The photographs, sorted by name, fall into K folds: fold k holds out every K-th, beginning with the k-th. A held-out
 photograph is treated as if it had not been taken, except that its camera is known: sparse points that fewer than two of
-the other photographs have found are left out. Each photograph is measured as rendered and after the best affine map of
-its colours, because nothing says what exposure it had; and once more in the pixels that at least two training
-photographs show (:mod:`.kit.coverage`), because the others are guessed.
+the other photographs have found are left out. Each photograph is measured as rendered; with the exposure that its own
+tracks show, of points that the others have found; and after the best affine map of its colours. The last also in the
+pixels that at least two training photographs show (:mod:`.kit.coverage`), because the others are guessed.
 
 Several scenes may be given. Then the first recipe is also compared, fold by fold, with the best other one of the scene,
 and a recipe is chosen as one must: on the other scenes, to be reported on the one left out. The claim is ours;
@@ -35,6 +35,7 @@ from minisplat_ref.methods.adaptive.numbers import TRAIN_VIEWS_MIN
 from minisplat_ref.metrics import ViewMetrics, correct_colors, evaluate, psnr
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.line_of_sight import hidden_share
+from minisplat_ref.strategy.track_gains import store_gains
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations
 from minisplat_ref.training.schedule import Recipe
@@ -117,7 +118,7 @@ def recipe_of(text: str) -> Recipe:
 
 def measure(fold: Fold, recipe: Recipe, seed: int) -> dict[str, Any]:
     """Train on a fold, and measure its held-out photographs at the end and, roughly, on the way."""
-    scene, curve = fold.scene, []
+    scene, curve = store_gains(fold.scene), []
     paused, every = 0.0, ITERATIONS // N_MOMENTS
     start = time.process_time()
 
@@ -165,6 +166,7 @@ def describe_photograph(view: View, image: Floats, metrics: ViewMetrics, coverag
     record: dict[str, Any] = {
         "name": view.name,
         "psnr": metrics.psnr,
+        "exposed": metrics.psnr_exposed,
         "corrected": metrics.psnr_corrected,
         "ssim": metrics.ssim,
         "known": None,
@@ -240,7 +242,7 @@ def summarise(records: Sequence[Mapping[str, Any]], scene: str, recipe: str) -> 
     own = [record for record in records if (record["scene"], record["recipe"]) == (scene, recipe)]
     photographs = [photograph for record in own for photograph in record["photographs"]]
     row: dict[str, Any] = {"scene": scene, "recipe": recipe, "n": len(photographs)}
-    for key in ("psnr", "corrected", "known", "ssim", "share_known"):
+    for key in ("psnr", "exposed", "corrected", "known", "ssim", "share_known"):
         values = [p[key] for p in photographs if p[key] is not None]
         row |= {key: float(np.median(values)), f"{key}_worst": min(values)} if values else {key: None}
     row["mean"] = float(np.mean([p["corrected"] for p in photographs]))
@@ -255,7 +257,19 @@ def summarise(records: Sequence[Mapping[str, Any]], scene: str, recipe: str) -> 
 
 def to_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the rows in Markdown."""
-    heading = ["scene", "recipe", "n", "median", "worst", "corrected: median", "worst", "mean", "known pixels", "SSIM"]
+    heading = [
+        "scene",
+        "recipe",
+        "n",
+        "median",
+        "worst",
+        "own exposure: median",
+        "corrected: median",
+        "worst",
+        "mean",
+        "known pixels",
+        "SSIM",
+    ]
     heading += ["known", "below its best", "hidden", "Gaussians", "seconds"]
     return markdown_table(heading, [_cells(row) for row in rows])
 
@@ -272,6 +286,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         str(row["n"]),
         form(row["psnr"], ".2f"),
         form(row["psnr_worst"], ".2f"),
+        form(row["exposed"], ".2f"),
         form(row["corrected"], ".2f"),
         form(row["corrected_worst"], ".2f"),
         f"{row['mean']:.2f}{error}",

@@ -39,7 +39,7 @@ from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.types import Frame, Gaussians
 
 FRAME = Frame((450_000.0, 5_410_000.0, 260.0), 0.5)
-RECIPE = configure(get_recipe("3dgs-accel"), exposure=True)
+RECIPE = configure(get_recipe("3dgs-accel"), exposure="learned")
 
 
 class Reader(NamedTuple):
@@ -132,7 +132,9 @@ def _read_cameras(_: Path, file: Path) -> object:
 
 def _write_config(folder: Path) -> None:
     scene = _scene().scene._replace(frame=FRAME)
-    own = Settings(scene="scene", recipe=RECIPE.name, schedule_iterations=10, iterations=10, set={"exposure": "true"})
+    own = Settings(
+        scene="scene", recipe=RECIPE.name, schedule_iterations=10, iterations=10, set={"exposure": "learned"}
+    )
     (folder / CONFIG).write_text(json.dumps(settings.to_config(own, RECIPE, scene)))
 
 

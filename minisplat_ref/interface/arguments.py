@@ -131,7 +131,7 @@ def assignment(text: str) -> tuple[str, str]:
     """Type of NAME=VALUE."""
     name, separator, value = text.partition("=")
     if not (name and separator and value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, like exposure=true")
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, like exposure=learned")
     return name.strip(), value.strip()
 
 

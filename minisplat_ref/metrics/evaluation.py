@@ -4,8 +4,10 @@ Renderings are clipped to [0, 1] but not rounded to 8 bits, which would add 1.3e
 at 30 dB. PSNR is computed from the mean squared error over all pixels and channels of an image; the released 3DGS
 script averages the PSNR of the channels instead, which is never lower. Means over views are means of the views' values.
 
-The exposure and white balance of a held-out photograph are unknown. So its PSNR is given twice: as rendered, and
-after the affine map of the colours that brings the rendering closest to the photograph (:func:`correct_colors`).
+A held-out photograph has an exposure of its own, which no training has seen. So its PSNR is given three times: as
+rendered; with the exposure that the photograph's own tracks of sparse points show (:attr:`View.log_gain`), for which
+nothing is fitted to its pixels beside the rendering's; and after the affine map of the colours that brings the
+rendering closest to the photograph (:func:`correct_colors`), which flatters.
 
 LPIPS needs the weights of a network, which are not ours to ship; an :class:`Evaluation` without them has a note of it.
 """
@@ -40,6 +42,8 @@ class ViewMetrics(NamedTuple):
     """None when it was not measured."""
     psnr_corrected: float | None = None
     """dB, after :func:`correct_colors`."""
+    psnr_exposed: float | None = None
+    """dB, with the gain that the view's own tracks show; where that is not known, as rendered."""
 
 
 class Evaluation(NamedTuple):
@@ -58,6 +62,8 @@ class Evaluation(NamedTuple):
     """VGG16 or AlexNet, with distances that cannot be compared with each other; None when LPIPS was not measured."""
     psnr_corrected: float | None = None
     """dB after :func:`correct_colors`, mean of the views; None without views."""
+    psnr_exposed: float | None = None
+    """dB with the gains that the views' own tracks show, mean of the views; None without views."""
 
 
 def psnr(image: Floats, target: Floats | Ints, mask: Bools | None = None) -> float:
@@ -164,13 +170,15 @@ def evaluate(
         check_views(network, views)
     per_view = []
     for view in (view.load() for view in views):
-        image = np.clip(settings.render_view(model, view)[0].image, 0.0, 1.0)  # [H, W, 3]
+        rendered = settings.render_view(model, view)[0].image  # [H, W, 3]
+        image = np.clip(rendered, 0.0, 1.0)
         metrics = ViewMetrics(
             view.name,
             psnr(image, view.image, view.mask),
             ssim(image, view.image, view.mask, backend=settings.backend),
             None if network is None else lpips(image, view.image, network, view.mask),
             psnr(correct_colors(image, view.image, view.mask), view.image, view.mask),
+            psnr(_expose(rendered, view.log_gain), view.image, view.mask),
         )
         per_view.append(metrics)
         if on_view is not None:
@@ -178,6 +186,7 @@ def evaluate(
     if not per_view:
         return Evaluation(None, None, None, NO_VIEWS, per_view)
     corrected = [view.psnr_corrected for view in per_view if view.psnr_corrected is not None]
+    exposed = [view.psnr_exposed for view in per_view if view.psnr_exposed is not None]
     distances = [view.lpips for view in per_view if view.lpips is not None]
     return Evaluation(
         float(np.mean([view.psnr for view in per_view])),
@@ -187,4 +196,11 @@ def evaluate(
         per_view,
         None if network is None else network.backbone.name,
         float(np.mean(corrected)),
+        float(np.mean(exposed)),
     )
+
+
+def _expose(rendered: Floats, log_gain: Floats | None) -> Floats:
+    """Return a rendering [H, W, 3] with the exposure of a photograph, if that is known, clipped to [0, 1]."""
+    gain = 1.0 if log_gain is None else np.exp(log_gain).astype(rendered.dtype)
+    return np.clip(rendered * gain, 0.0, 1.0)

@@ -22,6 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
 
 from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.types import Bools, Floats, Ints, Scene, View
@@ -29,7 +31,8 @@ from minisplat_ref.types import Bools, Floats, Ints, Scene, View
 REACH = 1  # pixels around an observation over which its colour is averaged
 DARK, BRIGHT = 8, 247  # of 255, ours: an observation with a pixel beyond them is left out
 N_ROUNDS = 30  # of reweighting, at most
-CONVERGED = 1e-6  # change of a log gain that ends the rounds
+CONVERGED = 1e-5  # change of a log gain that ends the rounds
+RIDGE = 1e-8  # of the mean diagonal entry of S, which is singular
 SCALE_MIN = 1e-3  # of the residuals, as rounding to 8 bits leaves about this much
 MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 OBSERVATIONS_MIN = 20  # ours: fewer do not determine the gain of a photograph
@@ -119,6 +122,30 @@ def estimate_gains(scene: Scene) -> TrackGains:
         rest = observed.log_colors[:, k] - gains[observed.view_ids, k]
         log_colors[ids, k] = np.bincount(inverse, rest) / n
     return TrackGains(gains, is_known, log_colors, *cross_validate(observed, n_views))
+
+
+def store_gains(scene: Scene) -> Scene:
+    """Return the scene with the log gains of its photographs, held-out ones included, if they are needed.
+
+    A scene that has gains stays as it is; so does one whose photographs are not known to differ.
+    """
+    if any(view.log_gain is not None for view in scene.train_views):
+        return scene
+    gains = estimate_gains(scene)
+    if not gains.are_needed:
+        return scene
+    trained = [g if known else None for g, known in zip(gains.log_gains, gains.is_known, strict=True)]
+    held_out = [fit_gain_of_view(view, gains, scene.points) for view in scene.test_views]
+    return scene._replace(
+        train_views=tuple(v._replace(log_gain=g) for v, g in zip(scene.train_views, trained, strict=True)),
+        test_views=tuple(v._replace(log_gain=g) for v, g in zip(scene.test_views, held_out, strict=True)),
+    )
+
+
+def spread_of_gains(views: Sequence[View]) -> float:
+    """Return the standard deviation of the mean log gains that views have; 0 if none has one."""
+    gains = [float(np.mean(view.log_gain)) for view in views if view.log_gain is not None]
+    return float(np.std(gains)) if gains else 0.0
 
 
 def cross_validate(observed: Observations, n_views: int) -> tuple[float, float, float]:
@@ -244,16 +271,20 @@ def _observe(index: int, view: View, points: Floats) -> Observations:
 def _solve(view: Ints, point: Ints, values: Floats, weights: Floats, n_views: int) -> tuple[Floats, Floats]:
     """Return the g [V] of weighted least squares, and the residuals e [M].
 
-    Only differences of g are determined. The solution of least norm has zero mean over photographs that share points,
-    directly or through others, and is 0 where nothing is observed.
+    Only differences of g are determined, between photographs that share points, directly or through others. In each
+    such part of the scene the mean of g is 0.
     """
-    shape = (int(point.max()) + 1, n_views)
-    W = sparse.csr_matrix((weights, (point, view)), shape=shape)  # [Q, V]
-    totals = np.bincount(point, weights)  # [Q] W_q
+    n_points = int(point.max()) + 1
+    W = sparse.csr_matrix((weights, (point, view)), shape=(n_points, n_views))  # [Q, V]
+    totals, per_view = np.bincount(point, weights), np.bincount(view, weights, minlength=n_views)  # [Q] W_q, [V]
     means = np.bincount(point, weights * values) / totals  # [Q]
-    S = np.diag(np.bincount(view, weights, minlength=n_views)) - (W.T @ sparse.diags(1 / totals) @ W).toarray()
     wanted = np.bincount(view, weights * (values - means[point]), minlength=n_views)
-    g = np.linalg.lstsq(S, wanted, rcond=1e-10)[0]
+    S = (sparse.diags(per_view) - W.T @ sparse.diags(1 / totals) @ W).tocsc()
+    solve = splu(S + RIDGE * per_view.mean() * sparse.identity(n_views, format="csc")).solve
+    g = solve(wanted)
+    g += solve(wanted - S @ g)  # what the ridge has changed
+    _, part = connected_components(S, directed=False)
+    g -= (np.bincount(part, g) / np.bincount(part))[part]
     rest = values - g[view]
     return g, rest - (np.bincount(point, weights * rest) / totals)[point]
 

@@ -1,7 +1,7 @@
 """Parameters that may be trained besides the Gaussians: exposures, poses, a sky, compensated opacities.
 
 Each is a set of shared parameters of the model, and a renderer that wraps another one and applies them. Each is off
-unless a recipe switches it on, or the user does with ``--set NAME=true``:
+unless a recipe switches it on, or the user does with ``--set NAME=true``, or with one of :data:`EXPOSURE_SOURCES`:
 
 ================  =======================================================================================
 ``exposure``      colours of each photograph
@@ -16,14 +16,17 @@ rendered as if nothing were calibrated. The others belong to the scene and affec
 *Exposure*, from the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
 as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies from the other side, so it
 stores the transpose of A_v. It also clamps c' to [0, 1], which stops the gradient where the result is too bright; here
-nothing is clamped. The scene's colours and the maps are determined up to one map that all views share.
+nothing is clamped. The scene's colours and the maps are determined up to one map that all views share. With
+``exposure=learned`` the maps are trained. With ``exposure=tracks`` they are the gains that the tracks of structure from
+motion show before any training (:mod:`minisplat_ref.strategy.track_gains`), and stay as they are; where the tracks show
+no difference there are none.
 
 *Pose*: the pose of view v is corrected on its left, ``R' = Q_v R, t' = Q_v t + u_v`` with ``Q_v = exp([w_v]_x)``, for a
 rotation vector w (radians, camera frame) and a shift u (world units, camera frame). The scene and the poses are
 determined up to a similarity transform that all views share: align held-out poses before comparing them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +46,7 @@ class Calibration(NamedTuple):
     """Shared parameters, and the renderer that applies them."""
 
     name: str
-    """``--set NAME=true`` switches the calibration on."""
+    """``--set NAME=true`` switches the calibration on; of exposures, one of :data:`EXPOSURE_SOURCES` says whence."""
     initial: Callable[[int], dict[str, Floats]]
     """``initial(n_views)`` returns the initial shared parameters by name."""
     wrap: Callable[[Renderer], Renderer]
@@ -57,10 +60,22 @@ class Calibration(NamedTuple):
 
 # --- exposure ---
 
+NONE, TRACKS, LEARNED = EXPOSURE_SOURCES = ("none", "tracks", "learned")
+"""What ``--set exposure=`` takes: no exposures, those that the tracks show, or exposures that are trained."""
+
 
 def identity_exposures(n_views: int) -> dict[str, Floats]:
     """Return the identity map [I | 0] for every view, [V, 3, 4] float32."""
     return {EXPOSURES: np.tile(np.eye(3, 4, dtype=np.float32), (n_views, 1, 1))}
+
+
+def exposures_of_gains(views: Sequence[View]) -> dict[str, Floats]:
+    """Return the maps ``c' = exp(g) c`` [V, 3, 4] float32 of views with log gains g; the identity for the others."""
+    exposures = identity_exposures(len(views))
+    for index, view in enumerate(views):
+        if view.log_gain is not None:
+            exposures[EXPOSURES][index, :, :3] = np.diag(np.exp(view.log_gain))
+    return exposures
 
 
 def expose(colors: Floats, exposure: Floats) -> Floats:
@@ -262,6 +277,9 @@ EXPOSURE = Calibration(
     "exposure", identity_exposures, with_exposures, Rates({EXPOSURES: LogLinear(1e-2, 1e-3, 30_000)})
 )
 """An affine map of the colours per photograph, with the rates of the 2024 update of 3DGS."""
+
+HELD_EXPOSURE = EXPOSURE._replace(rates=Rates({EXPOSURES: 0.0}))
+"""The same, as it begins."""
 
 POSE = Calibration(
     "pose",

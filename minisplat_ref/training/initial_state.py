@@ -11,9 +11,12 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.frames import choose_frame
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
+from minisplat_ref.strategy.track_gains import spread_of_gains, store_gains
 from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.calibration import EXPOSURE, TRACKS, exposures_of_gains
 from minisplat_ref.training.dense_start import densify_points
-from minisplat_ref.training.recipe_settings import settings_of
+from minisplat_ref.training.pace import Decision, Pace
+from minisplat_ref.training.recipe_settings import apply_decisions, settings_of
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import FILE_FRAME, Scene
@@ -59,8 +62,14 @@ def initial_state(
     shared = dict(representation.shared(scene, rng))
     for calibration in recipe.active_calibrations:
         shared |= calibration.initial(n_views)
+    pace = Pace()
+    if recipe.exposure == TRACKS and (spread := spread_of_gains(photographs := store_gains(scene).train_views)):
+        shared |= exposures_of_gains(photographs)
+        why = f"exposures differ by {spread:.1%}, as the tracks of the sparse points show"
+        pace = Pace(decisions=(Decision(0, "exposures", why, None, None),), switched_on=(EXPOSURE.name,))
     shared = {name: np.ascontiguousarray(array) for name, array in shared.items()}  # Adam writes through views
-    without_rate = [name for name in (*gaussians._fields, *shared) if name not in recipe.rates.of]
+    rates = apply_decisions(recipe, pace).rates
+    without_rate = [name for name in (*gaussians._fields, *shared) if name not in rates.of]
     if without_rate:
         raise InputError(
             f"recipe {recipe.name} has no learning rate for {', '.join(without_rate)} of {representation.name}: give"
@@ -76,6 +85,7 @@ def initial_state(
         shared=shared,
         shared_adam=zero_moments(shared),
         frame=scene.frame,
+        pace=pace,
     )
 
 

@@ -2,18 +2,20 @@
 
 A setting is a keyword argument that ``functools.partial`` has bound to a function of the recipe: an event's action, a
 loss term, or a part of the representation. Its name is the argument's, so that no list of settings is kept anywhere.
-Three more kinds have no function: weights of loss terms, calibrations that are on, and ``starts_densely``.
+Four more kinds have no function: weights of loss terms, calibrations that are on, the source of the exposures, and
+``starts_densely``.
 """
 
 import inspect
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import Renderer
+from minisplat_ref.training.calibration import EXPOSURE, EXPOSURE_SOURCES, HELD_EXPOSURE, LEARNED, TRACKS
 from minisplat_ref.training.pace import Pace
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import Recipe, bound_settings
@@ -27,13 +29,23 @@ DSSIM = "dssim_weight"
 
 def apply_decisions(recipe: Recipe, pace: Pace) -> Recipe:
     """Return the recipe with the calibrations on that a training has decided to use."""
-    return configure(recipe, **dict.fromkeys(pace.switched_on, True)) if pace.switched_on else recipe
+    return _switch_on(recipe, pace.switched_on)
 
 
 def match_calibrations(recipe: Recipe, model: Model) -> Recipe:
     """Return the recipe with the calibrations on that a model has parameters of."""
-    on = {c.name: True for c in recipe.calibrations if c.initial(1).keys() <= model.shared.keys()}
-    return configure(recipe, **on)
+    return _switch_on(recipe, [c.name for c in recipe.calibrations if c.initial(1).keys() <= model.shared.keys()])
+
+
+def _switch_on(recipe: Recipe, names: Collection[str]) -> Recipe:
+    """Return the recipe with these calibrations on; exposures that the tracks show are not trained."""
+    is_held = recipe.exposure == TRACKS
+    return recipe._replace(
+        calibrations=tuple(
+            (HELD_EXPOSURE if is_held and c.name == EXPOSURE.name else c)._replace(is_on=True) if c.name in names else c
+            for c in recipe.calibrations
+        )
+    )
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
@@ -46,11 +58,12 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
     events = [bound_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **bound_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
+    source = [{EXPOSURE.name: recipe.exposure}]
     parts = recipe.representation
     functions = (parts.extend, parts.shared, parts.renderer.render, parts.from_file)
     representation = [bound_settings(function) for function in functions if function is not None]
     start = [{START: recipe.starts_densely}]
-    found = [*events, *terms, *switches, *representation, *start]
+    found = [*events, *terms, *source, *switches, *representation, *start]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
@@ -66,6 +79,9 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
     for name, value in settings.items():
         if name not in known:
             raise InputError(f"recipe {recipe.name} has no {name} to set: choose from {', '.join(sorted(known))}")
+        is_source = name == EXPOSURE.name
+        if is_source and value not in EXPOSURE_SOURCES:
+            raise InputError(f"exposure={value}: choose from {', '.join(EXPOSURE_SOURCES)}")
         recipe = recipe._replace(
             events=tuple(event._replace(action=_bind(event.action, name, value)) for event in recipe.events),
             losses=tuple(
@@ -75,11 +91,14 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
                 for term in recipe.losses
             ),
             calibrations=tuple(
-                calibration._replace(is_on=value) if name == calibration.name else calibration
+                calibration._replace(is_on=value == LEARNED if is_source else value)
+                if name == calibration.name
+                else calibration
                 for calibration in recipe.calibrations
             ),
             representation=_configure_representation(recipe.representation, name, value),
             starts_densely=value if name == START else recipe.starts_densely,
+            exposure=value if is_source else recipe.exposure,
         )
     return recipe
 
@@ -136,6 +155,8 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
             f"recipe {recipe.name} has no {', '.join(unknown)} to set: choose from {', '.join(sorted(known))}"
         )
     weights = {term.name for term in recipe.losses}
+    if texts.get(EXPOSURE.name, TRACKS) not in EXPOSURE_SOURCES:
+        raise InputError(f"--set exposure={texts[EXPOSURE.name]}: choose from {', '.join(EXPOSURE_SOURCES)}")
     values = {name: _parse(name, text, known[name], name not in weights) for name, text in texts.items()}
     for name in sorted(weights & values.keys()):
         if not 0 <= values[name] < math.inf:

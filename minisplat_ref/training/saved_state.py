@@ -87,7 +87,7 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
         "rng": state.rng.bit_generator.state,
         "recipe": describe(recipe),
     }
-    if recipe.cooling is not None:
+    if recipe.cooling is not None or state.pace != Pace():
         metadata["pace"] = pace_to_json(state.pace)
     if state.shared_adam.joined:
         metadata["shared_adam_joined"] = dict(state.shared_adam.joined)
@@ -112,7 +112,8 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
             f"{path} was written by recipe {name} of {length} iterations with other settings than"
             f" {recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
         )
-    pace = Pace() if recipe.cooling is None else read_pace(path, metadata.get("pace"))
+    is_decided = recipe.cooling is not None or "pace" in metadata
+    pace = read_pace(path, metadata.get("pace")) if is_decided else Pace()
     bundles = read_bundles(path, arrays, recipe.representation.population)
     without_rate = [name for name in bundles.shared if name not in apply_decisions(recipe, pace).rates.of]
     if without_rate:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.calibration import CALIBRATIONS, Calibration
+from minisplat_ref.training.calibration import CALIBRATIONS, NONE, Calibration
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.pace import Cooling, Pace
 from minisplat_ref.training.rates import Rates
@@ -162,6 +162,8 @@ class Recipe(NamedTuple):
     """The population that is trained, and its renderer."""
     starts_densely: bool = False
     """Begin with points from stereo besides the sparse points (:mod:`minisplat_ref.training.dense_start`)."""
+    exposure: str = NONE
+    """Whence the photographs' exposures come, one of :data:`~minisplat_ref.training.calibration.EXPOSURE_SOURCES`."""
     cooling: Cooling | None = None
     """The end of a method without a schedule: its milestones do not scale with the length, and ``iterations`` is a
     limit. None for methods with a schedule."""

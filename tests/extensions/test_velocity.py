@@ -227,7 +227,7 @@ def scene_folder(truth, tmp_path_factory):
 @pytest.fixture(scope="module")
 def run_folder(scene_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "moving"
-    options = ("--recipe", "velocity", "--iterations", "60", "--set", "exposure=true", "--test-every", "6")
+    options = ("--recipe", "velocity", "--iterations", "60", "--set", "exposure=learned", "--test-every", "6")
     assert main(["train", str(scene_folder), *options, "--out", str(folder)]) == 0
     return folder
 
@@ -270,7 +270,7 @@ def test_images_are_of_their_times(run_folder, tmp_path, capsys):
 def test_resuming_is_not_noticed(run_folder, scene_folder, tmp_path, monkeypatch):
     """Interrupted at 25 of 60 iterations and continued: the same bytes."""
     out = tmp_path / "interrupted"
-    options = ("--recipe", "velocity", "--iterations", "60", "--set", "exposure=true", "--test-every", "6")
+    options = ("--recipe", "velocity", "--iterations", "60", "--set", "exposure=learned", "--test-every", "6")
     original = Progress.__call__
 
     def interrupting(self, report):

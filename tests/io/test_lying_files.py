@@ -152,7 +152,7 @@ def test_checkpoint_whose_header_is_no_header(tmp_path, refused):
 
 # checkpoints that are whole, and yet no state of a training
 
-RECIPE = configure(get_recipe("3dgs-accel"), exposure=True)._replace(iterations=2)
+RECIPE = configure(get_recipe("3dgs-accel"), exposure="learned")._replace(iterations=2)
 
 
 @pytest.fixture(scope="module")

@@ -112,6 +112,22 @@ def test_evaluation(rng, backend):
     assert seen[0][1].shape == (18, 24, 3) and seen[0][1].max() <= 1.0
 
 
+def test_a_photograph_s_own_exposure_by_hand(rng):
+    """A grey of 0.5 against photographs of 0.6 and 1: 20 and 6.02 dB, but for gains of 1.2 and 4 (clipped)."""
+    camera, background = make_camera(rng=rng), np.full(3, 0.5)
+    images = [np.full((camera.height, camera.width, 3), value, np.uint8) for value in (153, 255)]
+    views = [
+        View(f"view{gain}", camera, image, None, log_gain=np.log(np.full(3, gain)))
+        for image, gain in zip(images, (1.2, 4.0), strict=True)
+    ]
+    settings = RenderSettings(background, backend=REFERENCE)
+    result = evaluate(make_gaussians(rng, 0), views, settings)
+    assert [view.psnr for view in result.per_view] == pytest.approx([20.0, 20 * np.log10(2)])
+    assert all(view.psnr_exposed > 100 for view in result.per_view)
+    unknown = evaluate(make_gaussians(rng, 0), [view._replace(log_gain=None) for view in views], settings)
+    assert unknown.psnr_exposed == unknown.psnr == pytest.approx(result.psnr)
+
+
 def test_no_views(rng):
     result = evaluate(make_gaussians(rng, 3), [], RenderSettings(np.zeros(3), backend=REFERENCE))
     assert result.psnr is None and result.ssim is None and result.per_view == []

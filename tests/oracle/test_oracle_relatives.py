@@ -221,13 +221,13 @@ def test_held_fields_and_unused_ones_are_no_inputs():
 # --- parameters of photographs ---
 
 
-def with_exposure(is_on):
-    recipe = configure(GS_ACCEL, exposure=is_on)._replace(name="exposed")
+def with_exposure(source):
+    recipe = configure(GS_ACCEL, exposure=source)._replace(name="exposed")
     return Relative("exposed", GAUSSIANS, (), (recipe,), None)
 
 
 def test_calibrations_of_a_recipe_are_checked(small_proof, monkeypatch):
-    report = check_relative_gradients((REFERENCE,), GSPLAT_MAIN, with_exposure(True))
+    report = check_relative_gradients((REFERENCE,), GSPLAT_MAIN, with_exposure("learned"))
     assert [case.name for case in report.cases] == [
         f"render gaussians with exposure: {way}" for way in ("Jacobian", "inner products")
     ]
@@ -238,10 +238,10 @@ def test_calibrations_of_a_recipe_are_checked(small_proof, monkeypatch):
         return v_colors, v_exposure.T.reshape(v_exposure.shape)
 
     monkeypatch.setattr("minisplat_ref.training.calibration.expose_vjp", wrong)
-    report = check_relative_gradients((REFERENCE,), GSPLAT_MAIN, with_exposure(True))
+    report = check_relative_gradients((REFERENCE,), GSPLAT_MAIN, with_exposure("learned"))
     assert report.n_failed == 2 and EXPOSURES in report.cases[0].note
     assert (
-        check_relative_gradients((REFERENCE,), GSPLAT_MAIN, with_exposure(False)).n_failed == 1
+        check_relative_gradients((REFERENCE,), GSPLAT_MAIN, with_exposure("none")).n_failed == 1
     )  # nothing was checked
 
 

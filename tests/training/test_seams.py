@@ -40,7 +40,7 @@ from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM, GRADIENT_REL, ROUNDED_TO_FLOAT32
 
 SCHEDULED = ("--recipe", "3dgs-accel")
-CALIBRATED = {"exposure": True, "pose": True}
+CALIBRATED = {"exposure": "learned", "pose": True}
 
 
 class Labelled(NamedTuple):
@@ -285,13 +285,13 @@ MINI = RECIPES["mini-splatting"]
 
 def test_settings_are_of_events_terms_and_calibrations():
     settings = settings_of(MINI)
-    assert settings["exposure"] is False and settings["pose"] is False
+    assert settings["exposure"] == "none" and settings["pose"] is False
     assert settings["photometric"] == 1.0 and settings["dssim_weight"] == 0.2
     assert settings["metric"] is indoor and settings["budget"] is None and settings["threshold"] == 2e-4
 
 
 def test_what_is_set_is_set_and_nothing_else():
-    for name, value in {"exposure": True, "photometric": 0.5, "dssim_weight": 0.3, "threshold": 1e-3}.items():
+    for name, value in {"exposure": "learned", "photometric": 0.5, "dssim_weight": 0.3, "threshold": 1e-3}.items():
         changed = configure(MINI, **{name: value})
         assert settings_of(changed) == {**settings_of(MINI), name: value}
         assert describe(changed) != describe(MINI)
@@ -300,7 +300,7 @@ def test_what_is_set_is_set_and_nothing_else():
 
 
 TEXTS = [
-    ("exposure", "true", True),
+    ("exposure", "learned", "learned"),
     ("pose", "False", False),
     ("photometric", "0.5", 0.5),
     ("photometric", "2", 2.0),
@@ -324,8 +324,8 @@ def test_text_becomes_a_value_of_the_present_type(name, text, value):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("exposure", "1", "exposure=1 is neither true nor false"),
-        ("exposure", "none", "exposure=none is neither true nor false"),
+        ("pose", "1", "pose=1 is neither true nor false"),
+        ("exposure", "true", "exposure=true: choose from none, tracks, learned"),
         ("photometric", "much", "photometric=much is not a number, as photometric=1.0 is"),
         ("photometric", "none", "photometric=none is not a number"),
         ("photometric", "nan", "photometric=nan is not a number"),
@@ -561,7 +561,7 @@ def scene_folder(tmp_path_factory):
 
 def test_calibrated_training_from_end_to_end(scene_folder, tmp_path, capsys):
     """Twelve iterations at once, and eight and then four: the same bytes; and every command takes the run."""
-    options = [*SCHEDULED, "--set", "exposure=true", "--set", "pose=true", "--test-every", "4", "--seed", "5"]
+    options = [*SCHEDULED, "--set", "exposure=learned", "--set", "pose=true", "--test-every", "4", "--seed", "5"]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert main(["train", str(scene_folder), "--out", str(whole), "--iterations", "12", *options]) == 0
     assert json.loads((whole / "config.json").read_text())["recipe"]["calibrations"] == ["exposure", "pose"]

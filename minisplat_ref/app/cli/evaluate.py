@@ -16,8 +16,9 @@ views of its photographs (--test-every), other Gaussians (--model) and a run
 that has not ended into DIR/eval-..., another scene into --out, then required.
 Renders are clipped to [0, 1] and not rounded; SSIM has an 11 x 11 window and
 zero padding; the figures are means over the views. metrics.json also has the
-PSNR after the affine map of each view's colours that fits best: nothing says
-what exposure a held-out photograph had. --color-corrected prints it, too.
+PSNR with the exposure that the tracks of a view's sparse points show, and that
+after the affine map of its colours that fits best; --color-corrected prints
+both for each view, too.
 """
 EPILOG = """\
 LPIPS is null without the weights of VGG16 or AlexNet (net='alex'), which are
@@ -52,7 +53,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--model", type=Path, metavar="FILE", help="measure these Gaussians: a PLY or a compact file")
     parser.add_argument("--test-every", type=integer(1), metavar="K", help="measure every K-th view instead")
     parser.add_argument(
-        "--color-corrected", action="store_true", help="print the PSNR after the best affine map of the colours, too"
+        "--color-corrected",
+        action="store_true",
+        help="print the PSNR with each view's own exposure, and after the best affine map of its colours, too",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: see above)")
     parser.add_argument(
@@ -78,15 +81,13 @@ def run(args: argparse.Namespace) -> int:
         lpips_weights=args.lpips_weights,
     )
     width = max(len(view.name) for view in evaluation.per_view)
-    corrected = "  corrected" if args.color_corrected else ""
+    corrected = "  exposed  corrected" if args.color_corrected else ""
     print(f"{'view':<{width}}  PSNR dB{corrected}    SSIM{'' if evaluation.lpips is None else '   LPIPS'}")
     for view in evaluation.per_view:
-        corrected = f"  {view.psnr_corrected:9.2f}" if args.color_corrected else ""
+        corrected = f"  {view.psnr_exposed:7.2f}  {view.psnr_corrected:9.2f}" if args.color_corrected else ""
         lpips = "" if view.lpips is None else f"  {view.lpips:.4f}"
         print(f"{view.name:<{width}}  {view.psnr:7.2f}{corrected}  {view.ssim:.4f}{lpips}")
     print(summary(evaluation))
-    if args.color_corrected and evaluation.psnr_corrected is not None:
-        print(f"after the best affine map of each view's colours: PSNR {evaluation.psnr_corrected:.2f} dB")
     for note in notes:
         print(f"minisplat-ref: warning: {note}", file=sys.stderr)
     if folder != args.folder:

@@ -13,9 +13,8 @@ from minisplat_ref.interface.arguments import Commands, HelpFormatter
 if TYPE_CHECKING:
     from minisplat_ref.app.runs.options import Settings
     from minisplat_ref.io.label import Label
-    from minisplat_ref.types import Floats, Scene
+    from minisplat_ref.types import Floats
 
-N_NAMED = 3  # photographs of unusual exposure that are named
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations", "lpips_reason")  # of metrics.json: too long, or said elsewhere
 
 Rows = list[tuple[str, str]]
@@ -207,7 +206,7 @@ def _event_rows(folder: Path, settings: "Settings") -> Rows:
 
 def _scene_rows(path: Path, model: str | None) -> Rows:
     from minisplat_ref.app.inventory import take_inventory
-    from minisplat_ref.app.runs.notices import describe_place, describe_sizes
+    from minisplat_ref.app.runs.notices import describe_exposures, describe_place, describe_sizes
     from minisplat_ref.io import load_scene
     from minisplat_ref.io.frames import place_scene
 
@@ -225,24 +224,11 @@ def _scene_rows(path: Path, model: str | None) -> Rows:
         *([("masks", f"{n_masks} of {len(views)} views")] if n_masks else []),
         ("points", f"{len(scene.points):,}"),
         *_bounds_rows(scene.points),
-        ("exposures", _describe_exposures(scene)),
+        ("exposures", describe_exposures(scene)),
         ("extent", f"{scene.extent:.4g} world units"),
         *([("frame", place)] if place else []),
         ("background", _vector(scene.background)),
     ]
-
-
-def _describe_exposures(scene: "Scene") -> str:
-    """Describe the exposures of the training photographs, as the tracks of their sparse points show them."""
-    import numpy as np
-
-    from minisplat_ref.strategy.track_gains import estimate_gains
-
-    gains = estimate_gains(scene)
-    factors = np.exp(gains.log_gains.mean(axis=1))
-    far = [f"{scene.train_views[row].name} {factors[row]:.2f}" for row in gains.outliers[:N_NAMED]]
-    rest = f" and {len(gains.outliers) - N_NAMED} more" if len(gains.outliers) > N_NAMED else ""
-    return gains.describe() + (f"; far from the others, as a factor: {', '.join(far)}{rest}" if far else "")
 
 
 def _field_rows(fields: "Mapping[str, Floats]") -> Rows:

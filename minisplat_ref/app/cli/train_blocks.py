@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,9 +42,12 @@ def begin(folder: Path, settings: Settings, shape: tuple[int, int], options: "Tr
     from minisplat_ref.app.runs import run_folder
     from minisplat_ref.app.runs.preparation import prepare
     from minisplat_ref.app.runs.settings import to_config
+    from minisplat_ref.training.calibration import EXPOSURE, NONE
 
     _refuse_options(settings, options)
     run_folder.check_free(folder)
+    if EXPOSURE.name not in settings.set:  # every block has a mean exposure of its own
+        settings = replace(settings, set={**settings.set, EXPOSURE.name: NONE})
     whole = prepare(folder, settings)
     recipe, scene = whole.recipe, whole.scene
     check(settings, recipe, whole.state)

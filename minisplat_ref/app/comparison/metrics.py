@@ -30,6 +30,8 @@ class Metric(NamedTuple):
 
 METRICS = (
     Metric("psnr", "PSNR (dB)", ".2f", "difference"),
+    Metric("psnr_exposed", "PSNR with the photographs' own exposures (dB)", ".2f", "difference"),
+    Metric("psnr_corrected", "PSNR after the best affine map of the colours (dB)", ".2f", "difference"),
     Metric("ssim", "SSIM", ".4f", "difference"),
     Metric("lpips", "LPIPS", ".4f", "difference"),
     Metric("best_psnr", "best PSNR on the way (dB)", ".2f", "difference"),
@@ -52,7 +54,7 @@ METRICS = (
 RunMetrics = Mapping[str, float | None]
 """Values of one run by the keys of ``METRICS``; None where something was not measured or not reached."""
 
-PER_PHOTOGRAPH = ("psnr", "ssim", "lpips")
+PER_PHOTOGRAPH = ("psnr", "psnr_exposed", "psnr_corrected", "ssim", "lpips")
 """Keys of the metrics that each test view has."""
 
 
@@ -140,6 +142,8 @@ def read_metrics(folder: Path, target_psnr: float, render_fps: float) -> dict[st
     densifying, densified = peak_training_mb(read_log(folder / run_folder.LOG), end)
     return {
         "psnr": metrics["psnr"],
+        "psnr_exposed": metrics["psnr_exposed"],
+        "psnr_corrected": metrics["psnr_corrected"],
         "ssim": metrics["ssim"],
         "lpips": metrics["lpips"],
         "best_psnr": best["psnr"],

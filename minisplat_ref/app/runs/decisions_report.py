@@ -1,6 +1,6 @@
-"""The decisions of a training without a schedule, for a page: a paragraph, figures with the evidence, and a table.
+"""The decisions of a training, for a page: a paragraph, figures with the evidence, and a table.
 
-The recipe is ``adaptive`` (:mod:`minisplat_ref.training.pace`); each decision has its iteration and its reason.
+Most are those of ``adaptive`` (:mod:`minisplat_ref.training.pace`); each has its iteration and its reason.
 """
 
 import math
@@ -34,7 +34,7 @@ SIZES_TEXT = "Views of another size have their own line: larger ones show more t
 SLOPE_TEXT = "A red line has the slope by which it was decided that little was left to gain."
 
 
-def decisions_section(pace: Pace, n_iterations: int) -> str:
+def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
     """Return the part of a page about the decisions.
 
     Parameters
@@ -43,8 +43,10 @@ def decisions_section(pace: Pace, n_iterations: int) -> str:
         Of the end of the run.
     n_iterations : int
         That the run has done.
+    has_schedule : bool
+        Whether the recipe's length and rates are fixed.
     """
-    parts = [paragraph(story(pace, n_iterations))]
+    parts = [paragraph(story(pace, n_iterations, has_schedule=has_schedule))]
     if pace.measurements:
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
         is_by_slope = any(_is_of_slope(decision) for decision in pace.decisions)
@@ -55,7 +57,7 @@ def decisions_section(pace: Pace, n_iterations: int) -> str:
     return section("What was decided, and why", *parts)
 
 
-def story(pace: Pace, n_iterations: int) -> str:
+def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
     """Return the decisions as sentences."""
     n = len(pace.measurements)
     sentences = []
@@ -69,7 +71,9 @@ def story(pace: Pace, n_iterations: int) -> str:
             f"{len(pace.measurements[0].psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}:"
             f" {', at twice the size '.join(rises)}."
         )
-    sentences += [f"After iteration {d.step:,} {DONE.get(d.what, d.what)}: {d.why}{_error(d)}." for d in pace.decisions]
+    sentences += [f"{_date(d)} {DONE.get(d.what, d.what)}: {d.why}{_error(d)}." for d in pace.decisions]
+    if has_schedule:
+        return " ".join(sentences)
     if pace.cooling_from is None:
         sentences.append(f"It was stopped at iteration {n_iterations:,}, before the learning rates fell.")
     elif pace.last_step == n_iterations:
@@ -93,6 +97,10 @@ def _group_by_size(pace: Pace) -> list[tuple[Measurement, ...]]:
 
 def _error(decision: Decision) -> str:
     return "" if decision.standard_error is None else f" (standard error {decision.standard_error:.2f} dB)"
+
+
+def _date(decision: Decision) -> str:
+    return f"After iteration {decision.step:,}" if decision.step else "Before the first iteration"
 
 
 def _row(decision: Decision) -> list[str]:

@@ -25,6 +25,7 @@ from minisplat_ref.app.runs.settings import (
 )
 from minisplat_ref.errors import InputError
 from minisplat_ref.metrics import Evaluation
+from minisplat_ref.strategy.track_gains import store_gains
 from minisplat_ref.types import Model, Scene
 
 
@@ -84,7 +85,7 @@ def evaluate_run(
         saved = Saved(saved.model._replace(gaussians=given.gaussians), None)
     warn_of_model(saved.model, folder)
     warn_if_not_kept(settings.backend)
-    photographs = load_photographs(requested, frame)
+    photographs = store_gains(load_photographs(requested, frame))
     if not photographs.test_views:
         raise InputError(f"{requested.scene} has no test views: give --test-every above 0")
     network = load_lpips(requested, photographs)

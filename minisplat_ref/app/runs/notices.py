@@ -9,14 +9,18 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from minisplat_ref.app.inventory import take_inventory
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.io.frames import describe_frame
 from minisplat_ref.io.images import SIDE_MIN
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
+from minisplat_ref.strategy.track_gains import estimate_gains
 from minisplat_ref.types import FILE_FRAME, Model, Scene
 
 N_SIZES = 3  # of photographs that are all named
+N_NAMED = 3  # photographs of unusual exposure that are named
 FEW_POINTS = 20  # sparse points that are too few for a scene
 
 
@@ -68,6 +72,15 @@ def describe_place(scene: Scene) -> str:
         f"scene {scene.name} is {extent:.4g} units large{far}: while it is trained it is {describe_frame(scene.frame)};"
         " files keep its coordinates"
     )
+
+
+def describe_exposures(scene: Scene) -> str:
+    """Describe the exposures of the training photographs, as the tracks of their sparse points show them."""
+    gains = estimate_gains(scene)
+    factors = np.exp(gains.log_gains.mean(axis=1))
+    far = [f"{scene.train_views[row].name} {factors[row]:.2f}" for row in gains.outliers[:N_NAMED]]
+    rest = f" and {len(gains.outliers) - N_NAMED} more" if len(gains.outliers) > N_NAMED else ""
+    return gains.describe() + (f"; far from the others, as a factor: {', '.join(far)}{rest}" if far else "")
 
 
 def describe_sizes(sizes: Sequence[tuple[int, int]]) -> str:

@@ -101,7 +101,7 @@ class Settings:
     set: Annotated[
         dict[str, str],
         Option(
-            "a setting of the recipe, such as exposure=true",
+            "a setting of the recipe, such as exposure=learned",
             "NAME=VALUE",
             assignment,
             is_valid=lambda texts: all(isinstance(text, str) for text in texts.values()),

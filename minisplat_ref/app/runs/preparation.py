@@ -20,6 +20,8 @@ from minisplat_ref.app.runs.settings import (
 from minisplat_ref.app.runs.simplification import Target, check_before_training
 from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.errors import InputError
+from minisplat_ref.strategy.track_gains import store_gains
+from minisplat_ref.training.calibration import TRACKS
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
@@ -38,7 +40,7 @@ def prepare(folder: Path, settings: Settings) -> Training:
     """
     recipe = configure_recipe(settings)
     _check_minutes(settings.minutes, recipe)
-    scene = load_photographs(settings)
+    scene = _expose(load_photographs(settings), recipe)
     check_frame(settings, scene)
     if settings.eval_every:
         curve.check_views(scene)
@@ -55,11 +57,16 @@ def prepare_continued(folder: Path, settings: Settings, state: TrainState | None
         As for :func:`prepare`, or the scene is not the one that the run was trained on.
     """
     recipe = configure_recipe(settings)
-    scene = load_photographs(settings, load_frame(folder))
+    scene = _expose(load_photographs(settings, load_frame(folder)), recipe)
     fingerprint.check(folder, scene, settings.scene)
     network = load_lpips(settings, scene)
     state = _first_state(settings, scene, recipe) if state is None else state
     return Training(folder, scene, settings, recipe, state, network)
+
+
+def _expose(scene: Scene, recipe: Recipe) -> Scene:
+    """Return the scene with the gains that its tracks show, where they are trained with or measured with."""
+    return store_gains(scene) if scene.test_views or recipe.exposure == TRACKS else scene
 
 
 def _check_minutes(minutes: float | None, recipe: Recipe) -> None:

@@ -201,7 +201,7 @@ def _save(training: Training) -> bool:
             interruptions.defer()
             checkpoints.save(folder, state, recipe)
             save_model(folder, settings, state.model, state.frame)
-            if recipe.cooling is not None:
+            if recipe.cooling is not None or state.pace.decisions:
                 run_folder.write_json(folder / run_folder.DECISIONS, pace_to_json(state.pace))
     except KeyboardInterrupt:
         return False

@@ -16,7 +16,7 @@ from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.recipe_actions import Fired
 from minisplat_ref.app.runs.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
-from minisplat_ref.app.runs.settings import load
+from minisplat_ref.app.runs.settings import configure_recipe, load
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import PURPLE
 from minisplat_ref.io import read_image
@@ -28,7 +28,10 @@ from minisplat_ref.types import Scene
 N_SHOWN = 6  # test views with images; all are in the table
 LARGEST = 1000  # pixels of an image's longer side in the page
 
-VIEWS_TEXT = f"The training never saw these views. {ERROR_TEXT}"
+VIEWS_TEXT = f"""\
+The training never saw these views. PSNR is that of the rendering as it is; with the exposure that the photograph's own
+tracks show, to which nothing else is fitted; and after the affine map of the colours that fits best. {ERROR_TEXT}"""
+PSNRS = ("psnr", "psnr_exposed", "psnr_corrected")
 BLOCKS_TEXT = """\
 The scene was trained in blocks, each from the photographs in which it fills a quarter of the pixels. Of each block,
 this model has what lies in its core. The blocks' own pages are in the folder blocks."""
@@ -76,7 +79,8 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
         sections.append(section("Trained in blocks", paragraph(BLOCKS_TEXT), plan))
     if (folder / run_folder.DECISIONS).exists():
         pace = pace_from_json(run_folder.read_json_object(folder / run_folder.DECISIONS))
-        sections.append(decisions_section(pace, n_iterations))
+        has_schedule = configure_recipe(settings).cooling is None
+        sections.append(decisions_section(pace, n_iterations, has_schedule=has_schedule))
     if log:
         sections.append(section("How the training went", _curves(folder, log)))
     if (folder / run_folder.EVENTS).exists():
@@ -132,11 +136,18 @@ def _views(folder: Path, views: list[dict[str, Any]]) -> str:
         panels.append(view_panel(f"{view['name']}{rank}: {_describe_measures(view)}", *images))
     how = f" Shown are {n} of {len(ranked)}, from the worst to the best." if n < len(ranked) else " The worst is first."
     has_lpips = ranked[0]["lpips"] is not None
-    heading = ["view", "PSNR (dB)", "SSIM", *(["LPIPS"] if has_lpips else [])]
+    heading = [
+        "view",
+        "PSNR (dB)",
+        "with its own exposure",
+        "colours fitted",
+        "SSIM",
+        *(["LPIPS"] if has_lpips else []),
+    ]
     cells = [
         [
             view["name"],
-            "equal" if view["psnr"] is None else f"{view['psnr']:.2f}",
+            *("equal" if view[key] is None else f"{view[key]:.2f}" for key in PSNRS),
             f"{view['ssim']:.4f}",
             *([f"{view['lpips']:.4f}"] if has_lpips else []),
         ]

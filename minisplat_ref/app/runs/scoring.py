@@ -122,14 +122,20 @@ def _finite(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def summary(evaluation: Evaluation) -> str:
-    """Return the measures in half a line; of several views, which is the worst."""
+    """Return the measures in a line; of several views, which is the worst."""
     if evaluation.psnr is None or evaluation.ssim is None:
         return "no test views to measure"
     n_views = len(evaluation.per_view)
     lpips = "" if evaluation.lpips is None else f", LPIPS {evaluation.lpips:.4f} by {evaluation.lpips_network}"
     worst = min(evaluation.per_view, key=lambda view: view.psnr)
     and_worst = f"; the worst is {one_line(worst.name)} with {worst.psnr:.2f} dB" if n_views > 1 else ""
+    others = ""
+    if evaluation.psnr_exposed is not None and evaluation.psnr_corrected is not None:
+        others = (
+            f" ({evaluation.psnr_exposed:.2f} with the exposures that their tracks show,"
+            f" {evaluation.psnr_corrected:.2f} after the best affine map of the colours)"
+        )
     return (
-        f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}{lpips}"
+        f"PSNR {evaluation.psnr:.2f} dB{others}, SSIM {evaluation.ssim:.4f}{lpips}"
         f" (mean of {n_views} test view{'s'[: n_views > 1]}{and_worst})"
     )

@@ -16,6 +16,7 @@ from minisplat_ref.io.ply_file import property_names
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, are_seen
 from minisplat_ref.strategy.ops import contiguous, n_rows
 from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.calibration import EXPOSURE, LEARNED
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
@@ -139,7 +140,8 @@ def _check_shared(folder: Path, model: Model, state: TrainState, recipe: Recipe)
     for name, values in model.shared.items():
         if name not in state.shared:
             switches = [c.name for c in recipe.calibrations if name in c.initial(1)]
-            way_out = f"add --set {switches[0]}=true" if switches else "take the recipe of that run"
+            value = LEARNED if switches == [EXPOSURE.name] else "true"
+            way_out = f"add --set {switches[0]}={value}" if switches else "take the recipe of that run"
             raise InputError(
                 f"{folder} has parameters {name} besides its Gaussians, which recipe {recipe.name} does not train:"
                 f" {way_out}"

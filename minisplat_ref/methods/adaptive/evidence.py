@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
     """The evidence of the photographs about a calibration."""
 
     gain: float
-    """dB of the squared error, mean over the photographs."""
+    """dB of the squared error, mean over the photographs; of a sky, of the sums over all of them."""
     standard_error: float
     """dB."""
     fitted: Floats
@@ -66,7 +66,8 @@ class Evidence(NamedTuple):
         verb = "improves" if what.startswith("a ") else "improve"
         if self.gain < 0:
             verb = verb.replace("improve", "worsen")
-        return f"{what}, fitted to {fitted_to}, {verb} {judged_by} by {abs(self.gain):.2f} dB"
+        amount = f"{abs(self.gain):.2f} ± {self.standard_error:.2f} dB"
+        return f"{what}, fitted to {fitted_to}, {verb} {judged_by} by {amount}"
 
     @property
     def spread(self) -> float:

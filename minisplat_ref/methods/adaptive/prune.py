@@ -7,11 +7,13 @@ repairs what it can, and the changes are recomputed.
 
 The cost is measured, too, on the training views that are held out: before each slice their PSNR and SSIM are
 compared with the best so far. When the next slice would cost more than a tenth of a decibel, or five thousandths of
-SSIM, in all, the prune ends. It also ends where no further slice is due: at the end of the cool-down nothing is
-removed, and all photographs are trained on, so that it can converge.
+SSIM, in all, the prune ends. The cost is that less its standard error over the views: where these disagree, the smaller
+model is as good as far as can be said. The prune also ends where no further slice is due: at the end of the cool-down
+nothing is removed, and all photographs are trained on, so that it can converge.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,11 +76,12 @@ def prune_in_slices(
     iteration.fetch()
     now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
     state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
-    psnr_cost, ssim_cost = foreseen_costs(state.pace.before_slices)
-    if psnr_cost > max_psnr_cost or ssim_cost > max_ssim_cost:
+    psnr, ssim = foresee_costs(state.pace.before_slices)
+    if psnr.certain > max_psnr_cost or ssim.certain > max_ssim_cost:
         why = (
-            f"with more removed, the held-out views might lose {psnr_cost:.2f} dB and {ssim_cost:.4f} of SSIM in all;"
-            f" at most {max_psnr_cost:g} dB and {max_ssim_cost:g} are allowed"
+            f"with more removed, the held-out views might lose {psnr.mean:.2f} ± {psnr.standard_error:.2f} dB and"
+            f" {ssim.mean:.4f} ± {ssim.standard_error:.4f} of SSIM in all; at most {max_psnr_cost:g} dB and"
+            f" {max_ssim_cost:g} are allowed"
         )
         state.pace = state.pace.with_decision(Decision(iteration.step, "prune ended", why, None, None))
         take_all_views(state, iteration)
@@ -109,17 +112,36 @@ def is_prune_done(pace: Pace, step: int) -> bool:
     return since > LAST_SLICE * (pace.last_step - pace.cooling_from)
 
 
-def foreseen_costs(before_slices: Sequence[Measurement]) -> tuple[float, float]:
+class Cost(NamedTuple):
+    """What a prune costs the held-out views."""
+
+    mean: float
+    """Over the views."""
+    standard_error: float
+    """Of the mean."""
+
+    @property
+    def certain(self) -> float:
+        """Return the part of the cost that is beyond its error."""
+        return self.mean - self.standard_error
+
+
+def foresee_costs(before_slices: Sequence[Measurement]) -> tuple[Cost, Cost]:
     """Return the estimated cost of the prune after one more slice: PSNR in dB, and SSIM.
 
-    The cost so far is the best value less the present one; one more slice is assumed to cost ``COST_RISE`` times as
-    much as the last one. Before the first slice both are 0.
+    The cost so far is the value of the slice with the best mean less the present one; one more slice is assumed to cost
+    ``COST_RISE`` times as much as the last one, unless the views have gained by that. Before the first slice both
+    are 0.
     """
-    costs = []
-    for values in ([m.psnr for m in before_slices], [m.ssim for m in before_slices]):
-        last = max(0.0, values[-2] - values[-1]) if len(values) > 1 else 0.0
-        costs.append(max(values) - values[-1] + COST_RISE * last)
-    return costs[0], costs[1]
+    return _foresee([m.psnrs for m in before_slices]), _foresee([m.ssims for m in before_slices])
+
+
+def _foresee(before_slices: Sequence[Sequence[float]]) -> Cost:
+    """Return the cost of one more slice by the values [S, V] before each slice, of each view."""
+    values = np.array(before_slices)
+    last = values[-2] - values[-1] if len(values) > 1 else np.zeros(values.shape[1])
+    lost = values[values.mean(axis=1).argmax()] - values[-1] + (COST_RISE * last if last.mean() > 0 else 0.0)
+    return Cost(float(lost.mean()), float(lost.std(ddof=1) / np.sqrt(len(lost))))
 
 
 def take_all_views(state: TrainState, iteration: Iteration) -> None:

@@ -73,7 +73,9 @@ class Switch:
         if isinstance(answer, str):
             return answer
         min_gain = min_gains[f"min_{self.calibration.name}_gain"]
-        return answer if answer.evidence.is_above(min_gain, self.n_errors) else answer.why
+        if answer.evidence.is_above(min_gain, self.n_errors):
+            return answer
+        return f"{answer.why}; it takes {min_gain:g} dB and {self.n_errors:g} standard error{'s'[: self.n_errors > 1]}"
 
 
 def add_calibration(

@@ -244,7 +244,7 @@ def test_the_scheduler_is_killed(scene_folder, finished, tmp_path, phase):
         (["--max-drop", "0.1"], "--max-drop does not go with --blocks"),
         (["--eval-every", "5"], "--eval-every does not go with --blocks"),
         (["--blocks", "9x1"], "--blocks 9x1 cannot be made, a slab has 8 cameras for 9 blocks"),
-        (["--set", "exposure=true"], "recipe 3dgs-accel also trains"),
+        (["--set", "exposure=learned"], "recipe 3dgs-accel also trains"),
         (["--recipe", "lens"], "--blocks needs photographs without distortion"),
     ],
 )

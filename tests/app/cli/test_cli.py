@@ -132,10 +132,10 @@ def test_a_run_is_repeated_from_its_config(run_folder, tmp_path):
     assert main(["train", "--config", str(config), "--out", str(again)]) == 0
     assert (again / "point_cloud.ply").read_bytes() == (run_folder / "point_cloud.ply").read_bytes()
     assert read_json(again / "config.json")["settings"] == read_json(config)["settings"]
-    changed = ["--iterations", "2", "--set", "exposure=true", "--out", str(other)]
+    changed = ["--iterations", "2", "--set", "exposure=learned", "--out", str(other)]
     assert main(["train", "--config", str(run_folder), *changed]) == 0  # the folder will do, too
     settings = read_json(other / "config.json")["settings"]
-    assert (settings["iterations"], settings["seed"], settings["set"]) == (2, 3, {"exposure": "true"})
+    assert (settings["iterations"], settings["seed"], settings["set"]) == (2, 3, {"exposure": "learned"})
 
 
 def test_train_logs_every_few_steps(run_folder):

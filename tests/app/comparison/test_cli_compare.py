@@ -105,7 +105,16 @@ def test_compare_json_says_what_the_runs_say(compared, scene_folder):
     for recipe in (first, second):
         run = recipe["runs"][0]
         metrics = read_json(folder / run["folder"] / "metrics.json")
-        for key in ("psnr", "ssim", "lpips", "n_gaussians", "train_seconds", "peak_rss_mb"):
+        for key in (
+            "psnr",
+            "psnr_exposed",
+            "psnr_corrected",
+            "ssim",
+            "lpips",
+            "n_gaussians",
+            "train_seconds",
+            "peak_rss_mb",
+        ):
             assert run[key] == recipe["mean"][key] == metrics[key]
         assert run["iterations_per_second"] == metrics["iterations"] / metrics["train_seconds"]
         ply = folder / run["folder"] / "point_cloud.ply"
@@ -123,7 +132,8 @@ def test_compare_json_says_what_the_runs_say(compared, scene_folder):
     assert first["mean"]["seconds_to_first"] <= first["mean"]["train_seconds"]
     assert first["mean"]["iterations_to_first"] <= ITERATIONS[0]
     assert second["relative_to_first"]["best_iteration"] is None
-    assert second["error_of_difference"] == dict.fromkeys(("psnr", "ssim", "lpips", "best_psnr"))  # of one seed
+    differences = ("psnr", "psnr_exposed", "psnr_corrected", "ssim", "lpips", "best_psnr")
+    assert second["error_of_difference"] == dict.fromkeys(differences)  # of one seed
 
 
 def test_what_fired_is_told(compared):

@@ -165,8 +165,11 @@ def test_what_the_trainings_are_told(compared):
     assert f" {expected} --out " in " ".join(runs_module.stored_words(folder, 3))
 
 
+ALIKE = {"psnr_exposed": 20.0, "psnr_corrected": 20.0}  # of every photograph
+
+
 def photographs(*psnrs):
-    return {f"p{i}": {"psnr": psnr, "ssim": 0.5, "lpips": None} for i, psnr in enumerate(psnrs)}
+    return {f"p{i}": {**ALIKE, "psnr": psnr, "ssim": 0.5, "lpips": None} for i, psnr in enumerate(psnrs)}
 
 
 def test_the_difference_is_paired_by_photograph():
@@ -203,9 +206,9 @@ def test_a_photograph_is_the_mean_of_its_seeds(tmp_path):
     }
     for name, views in per_view.items():
         (tmp_path / name).mkdir()
-        content = [{"name": view, "psnr": psnr, "ssim": ssim, "lpips": None} for view, psnr, ssim in views]
+        content = [{**ALIKE, "name": view, "psnr": psnr, "ssim": ssim, "lpips": None} for view, psnr, ssim in views]
         (tmp_path / name / "metrics.json").write_text(json.dumps({"per_view": content}))
     assert read_photographs(tmp_path / name for name in per_view) == {
-        "a": {"psnr": 11.5, "ssim": 0.5, "lpips": None},
-        "b": {"psnr": 21.0, "ssim": None, "lpips": None},
+        "a": {**ALIKE, "psnr": 11.5, "ssim": 0.5, "lpips": None},
+        "b": {**ALIKE, "psnr": 21.0, "ssim": None, "lpips": None},
     }

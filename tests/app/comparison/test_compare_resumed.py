@@ -135,7 +135,10 @@ def test_a_run_without_a_checkpoint_is_started_again(scene_folder, folder):
 
 @pytest.mark.parametrize(
     ("options", "difference"),
-    [(["--seed", "1"], "seed is 1 and not 0"), (["--set", "exposure=true"], "set is {'exposure': 'true'} and not {}")],
+    [
+        (["--seed", "1"], "seed is 1 and not 0"),
+        (["--set", "exposure=learned"], "set is {'exposure': 'learned'} and not {}"),
+    ],
 )
 def test_runs_of_other_settings_are_refused(scene_folder, folder, capfd, options, difference):
     """Finished ones as well, and before anything is trained."""

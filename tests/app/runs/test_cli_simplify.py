@@ -339,7 +339,7 @@ def test_a_budget_of_more_than_all_keeps_all_that_matter(run_folder, scene_folde
 
 def test_of_an_extension(scene_folder, tmp_path):
     """A population with one more field, whose bytes count; shared parameters and exposures come along."""
-    run = trained(scene_folder, tmp_path / "run", "--recipe", "velocity", "--set", "exposure=true")
+    run = trained(scene_folder, tmp_path / "run", "--recipe", "velocity", "--set", "exposure=learned")
     assert simplify(run, tmp_path / "out", "--budget", "40") == 0
     population = find_recipe("velocity").representation.population
     assert load_ply(tmp_path / "out" / "point_cloud.ply", population).velocities.shape == (40, 3)

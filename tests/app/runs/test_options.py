@@ -28,7 +28,7 @@ GIVEN = {
     "simplify": "rank",
     "scene_type": "outdoor",
     "extension": "velocity",
-    "set": "exposure=true",
+    "set": "exposure=learned",
     "eval_every": "5",
     "drop_bad_steps": None,
     "lpips_weights": "/weights.npz",

@@ -219,7 +219,7 @@ def test_compare_starts_all_from_it(scene_folder, dense, tmp_path, capfd, monkey
 def few(scene_folder, tmp_path_factory):
     """A run with the exposures of its photographs."""
     out = tmp_path_factory.mktemp("runs") / "few"
-    assert train(scene_folder, out, "--recipe", "3dgs-accel", "--iterations", "4", "--set", "exposure=true") == 0
+    assert train(scene_folder, out, "--recipe", "3dgs-accel", "--iterations", "4", "--set", "exposure=learned") == 0
     return out
 
 
@@ -229,7 +229,7 @@ def scene_of(scene_folder):
 
 def test_a_run_goes_on_where_it_ended(few, scene_folder):
     """Every field is that of the result, and so is the exposure; moments begin afresh."""
-    recipe = configure(find_recipe("3dgs", 10), exposure=True)
+    recipe = configure(find_recipe("3dgs", 10), exposure="learned")
     start = make_start(few, scene_of(scene_folder), recipe, 0)
     saved = newest_model(few, load(few)).model
     for name, field in start.state.gaussians._asdict().items():
@@ -248,7 +248,7 @@ def test_a_run_goes_on_where_it_ended(few, scene_folder):
     ("recipe", "settings", "says"),
     [
         ("3dgs", {}, "has parameters exposures besides its Gaussians, which recipe 3dgs does not train: add --set exp"),
-        ("velocity", {}, "which recipe velocity does not train: add --set exposure=true"),
+        ("velocity", {}, "which recipe velocity does not train: add --set exposure=learned"),
     ],
 )
 def test_parameters_that_a_recipe_lacks_are_named(few, scene_folder, recipe, settings, says):
@@ -259,7 +259,7 @@ def test_parameters_that_a_recipe_lacks_are_named(few, scene_folder, recipe, set
 def test_another_number_of_photographs_is_refused(few, scene_folder):
     scene = place_scene(load_scene(scene_folder, test_every=2))
     with pytest.raises(InputError, match="give the photographs of that run, divided by the same --test-every"):
-        make_start(few, scene, configure(find_recipe("3dgs", 10), exposure=True), 0)
+        make_start(few, scene, configure(find_recipe("3dgs", 10), exposure="learned"), 0)
 
 
 def test_a_run_of_another_place_is_refused(few, scene_folder):

@@ -100,7 +100,15 @@ def test_known_pixels_by_hand():
 
 def record(scene, fold, recipe, values, curve=None):
     photographs = [
-        {"name": str(i), "psnr": v - 1, "corrected": v, "ssim": v / 100, "known": v + 1, "share_known": 0.5}
+        {
+            "name": str(i),
+            "psnr": v - 1,
+            "exposed": v - 0.5,
+            "corrected": v,
+            "ssim": v / 100,
+            "known": v + 1,
+            "share_known": 0.5,
+        }
         for i, v in enumerate(values)
     ]
     curve = curve or [[250, 5.0, 30.0, 10], [500, 9.0, float(np.mean(values)), 20]]
@@ -119,7 +127,13 @@ RECORDS = [
 
 def test_rows_by_hand():
     row = folds.summarise(RECORDS, "x", "a")
-    assert (row["n"], row["corrected"], row["corrected_worst"], row["psnr"]) == (4, 21.5, 20, 20.5)
+    assert (row["n"], row["corrected"], row["corrected_worst"], row["psnr"], row["exposed"]) == (
+        4,
+        21.5,
+        20,
+        20.5,
+        21.0,
+    )
     assert row["mean"] == 21.75 and row["standard_error"] == pytest.approx(np.std([20, 22, 21, 24], ddof=1) / 2)
     assert row["fall"] == pytest.approx((9.0 + 7.5) / 2)  # 30 - 21 and 30 - 22.5
     assert row["hidden_test"] == pytest.approx(0.1) and row["hidden_train"] is None and row["seconds"] == 9.0

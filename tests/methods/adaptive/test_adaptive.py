@@ -16,7 +16,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.adaptive import prune
 from minisplat_ref.methods.adaptive.growth import grow
 from minisplat_ref.methods.adaptive.progress import proceed_when_little_is_gained
-from minisplat_ref.methods.adaptive.prune import N_SLICES, foreseen_costs, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.prune import N_SLICES, foresee_costs, prune_in_slices, slice_due
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.rendering import SPLATTING, RenderSettings
@@ -248,13 +248,25 @@ def of_values(psnrs, ssims):
 
 def test_what_the_prune_will_have_cost():
     """The best less the present value, and twice what the last slice cost."""
-    assert foreseen_costs(of_values([20.0], [0.5])) == (0.0, 0.0)
-    assert_allclose(foreseen_costs(of_values([20.0, 20.3], [0.5, 0.49])), (0.0, 0.03))
-    assert_allclose(foreseen_costs(of_values([20.0, 20.3, 20.25, 20.22], [0.5] * 4)), (0.08 + 0.06, 0.0))
+    assert foresee_costs(of_values([20.0], [0.5])) == ((0.0, 0.0), (0.0, 0.0))
+    assert_allclose(foresee_costs(of_values([20.0, 20.3], [0.5, 0.49])), [(0.0, 0.0), (0.03, 0.0)], atol=1e-12)
+    costs = foresee_costs(of_values([20.0, 20.3, 20.25, 20.22], [0.5] * 4))
+    assert_allclose(costs, [(0.08 + 0.06, 0.0), (0.0, 0.0)], atol=1e-12)
+
+
+def test_views_that_disagree_make_the_cost_uncertain():
+    """One view loses 0.2 dB, the other gains 0.1; with twice that to come 0.6 and -0.3: 0.15 dB, and 0.45 is its error.
+
+    The deviations from the mean are 0.45 each: the root of 2 x 0.45^2 / (2 - 1) / 2.
+    """
+    slices = [Measurement(10 * k, psnrs, 10, 0, (0.5, 0.5)) for k, psnrs in enumerate([(20.0, 22.0), (19.8, 22.1)])]
+    cost, _ = foresee_costs(slices)
+    assert_allclose(cost, (0.15, 0.45), atol=1e-12)
+    assert cost.certain == pytest.approx(-0.3)
 
 
 @pytest.mark.parametrize(
-    ("limits", "ends"), [((0.1, np.inf), "0.30 dB"), ((np.inf, 0.005), "0.0300 of SSIM"), ((1, 1), "")]
+    ("limits", "ends"), [((0.1, np.inf), "0.30 ± 0.00 dB"), ((np.inf, 0.005), "0.0300 ± 0.0000 of SSIM"), ((1, 1), "")]
 )
 def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypatch, limits, ends):
     """After a slice that cost 0.1 dB and 0.01 of SSIM, the next would make it thrice as much; then all train."""

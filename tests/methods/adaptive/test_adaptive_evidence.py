@@ -39,10 +39,10 @@ def test_half_by_hand():
 def test_evidence_is_told_in_words():
     found = Evidence(0.731, 0.1, np.zeros((3, 1)))
     assert found.describe("exposures that differ by 4.3%") == (
-        "exposures that differ by 4.3%, fitted to one half of each photograph, improve the other half by 0.73 dB"
+        "exposures that differ by 4.3%, fitted to one half of each photograph, improve the other half by 0.73 ± 0.10 dB"
     )
     worse = found._replace(gain=-0.03).describe("a sky in place of 9 large Gaussians", "half of them", "the others")
-    assert worse == "a sky in place of 9 large Gaussians, fitted to half of them, worsens the others by 0.03 dB"
+    assert worse == "a sky in place of 9 large Gaussians, fitted to half of them, worsens the others by 0.03 ± 0.10 dB"
 
 
 def test_a_field_of_zeros_explains_nothing():
