@@ -23,7 +23,8 @@ fitted to one half of the photographs, or of each photograph, improve the other 
 *Begin densely.* Stereo adds surface points where structure from motion has found few
 (:mod:`minisplat_ref.training.dense_start`).
 
-*Look through.* Gaussians that lie before sparse points which photographs show are removed every 100 iterations.
+*Look through.* Gaussians that lie before sparse points which photographs show are removed every 100 iterations, and
+those beside a camera, nearer than what is known around it.
 
 *Prune.* While the rates fall, Gaussians that the photographs would hardly miss are removed in slices.
 
@@ -39,7 +40,7 @@ fitted to one half of the photographs, or of each photograph, improve the other 
 ``pose``          the pose of each photograph
 ``antialiasing``  compensated opacities, where photographs differ in resolution
 ``sky``           a sky behind the scene
-``veils``         Gaussians before sparse points that photographs show, which are removed
+``veils``         Gaussians before sparse points that photographs show or beside cameras, which are removed
 ``prune``         removal of Gaussians while the rates fall
 ================  ==================================================================================================
 """

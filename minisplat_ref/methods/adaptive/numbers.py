@@ -121,6 +121,13 @@ VEIL_START = 500
 VEIL_VIEWS_MAX, VEIL_RAYS_MAX = 8, 256
 """Training views that are looked at each time, and rays of each, at most, so that this takes a small part of the time:
 a quarter of a second, every 100 iterations."""
+CLEARANCE = 0.5
+"""Radius of the free ball around a camera, in units of the distance of its nearest sparse points. The other half of the
+way is for surfaces between these points: those of a wall may be 2.4 times as far apart as the wall is from the camera
+before it lies within half of their distance."""
+CLEARANCE_SIGMAS = 1.0
+"""Standard deviations that a Gaussian is blurred by the ball. With two, bare walls that training has not yet sharpened
+count as fog: 78 of their Gaussians, not 22 (M)."""
 
 # --- pruning ---
 

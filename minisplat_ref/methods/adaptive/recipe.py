@@ -72,6 +72,7 @@ ADAPTIVE = GS._replace(
                 remove_veils,
                 max_share_before=numbers.VEIL_SHARE,
                 min_weight_before=numbers.VEIL_WEIGHT_MIN,
+                clearance=numbers.CLEARANCE,
                 start=numbers.VEIL_START,
             )
         ),

@@ -1,18 +1,21 @@
-"""Removal of veils by ``adaptive``: Gaussians that lie in front of sparse points which photographs show.
+"""Removal of veils by ``adaptive``: Gaussians where photographs and cameras show that there is nothing.
 
 Where a photograph shows a sparse point, nothing opaque lies between the camera and the point. A Gaussian may be blended
 there all the same, because it makes that photograph right where its depth does not matter; any other camera sees it as
 fog. Its error is invisible in the training photographs, and its opacity gets no gradient that would remove it. So
 :mod:`minisplat_ref.strategy.line_of_sight` computes which part of a Gaussian's contribution to the rays of sparse
-points lies in front of these points, and Gaussians with a large part are removed. Gaussians on no such ray are not
-judged.
+points lies in front of these points, and Gaussians with a large part are removed. Those on no such ray are judged by
+:mod:`minisplat_ref.strategy.camera_clearance` alone: beside a camera, nearer than what is known around it, there is
+nothing, though no photograph looks there but from the far side.
 """
 
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive.numbers import PERIOD, VEIL_RAYS_MAX, VEIL_VIEWS_MAX
+from minisplat_ref.methods.adaptive.numbers import CLEARANCE_SIGMAS, PERIOD, VEIL_RAYS_MAX, VEIL_VIEWS_MAX
+from minisplat_ref.rendering import activate
+from minisplat_ref.strategy.camera_clearance import are_in_free_balls, find_free_balls
 from minisplat_ref.strategy.line_of_sight import MARGIN, trace_sight_lines
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
@@ -20,9 +23,15 @@ from minisplat_ref.types import Floats
 
 
 def remove_veils(
-    state: TrainState, iteration: Iteration, *, max_share_before: float, min_weight_before: float, start: int
+    state: TrainState,
+    iteration: Iteration,
+    *,
+    max_share_before: float,
+    min_weight_before: float,
+    clearance: float,
+    start: int,
 ) -> str | None:
-    """Remove Gaussians that the sparse points of the training views contradict.
+    """Remove Gaussians that the sparse points of the training views, or their cameras, contradict.
 
     Parameters
     ----------
@@ -32,6 +41,9 @@ def remove_veils(
         A Gaussian stays if at most this share of its weight on the rays of sparse points is before the points.
     min_weight_before : float
         And it stays if its weight before points is less than this in total; one opaque pixel is 1.
+    clearance : float
+        Radius of the free balls around cameras, in units of the distance of the nearest sparse points; with 0 there are
+        none.
     start : int
         Nothing is removed until this iteration: Gaussians that cover much at first lie on several surfaces.
     """
@@ -39,9 +51,12 @@ def remove_veils(
         return None
     before, all_ = weigh_sight_lines(state, iteration)
     is_veil = (before > max_share_before * all_) & (before >= min_weight_before)
-    if is_veil.any():
-        apply_edit(state, keep(state.gaussians, ~is_veil))
-    return f"{np.count_nonzero(is_veil)} stood before points that photographs show"
+    balls = find_free_balls(iteration.scene.train_views, iteration.scene.points, clearance)
+    is_beside = are_in_free_balls(activate(state.gaussians), balls, CLEARANCE_SIGMAS) & ~is_veil
+    if (is_veil | is_beside).any():
+        apply_edit(state, keep(state.gaussians, ~(is_veil | is_beside)))
+    n_veils, n_beside = np.count_nonzero(is_veil), np.count_nonzero(is_beside)
+    return f"{n_veils} stood before points that photographs show, {n_beside} beside cameras"
 
 
 def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:

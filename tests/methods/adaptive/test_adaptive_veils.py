@@ -1,4 +1,4 @@
-"""Veils: Gaussians before the sparse points of a photograph go, and nothing else does."""
+"""Veils: Gaussians before the sparse points of a photograph go, and those beside a camera; nothing else does."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from scenes import make_camera
 
 CAMERA = make_camera(33, 33, fx=30.0, fy=30.0)
 POINTS = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]])
-SETTINGS = {"max_share_before": 0.5, "min_weight_before": 0.1, "start": 500}
+SETTINGS = {"max_share_before": 0.5, "min_weight_before": 0.1, "clearance": 0.5, "start": 500}
 
 
 def gaussians(means, opacities, scale=0.1):
@@ -24,7 +24,7 @@ def gaussians(means, opacities, scale=0.1):
     return Gaussians(
         np.array(means, np.float32),
         np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        np.full((n, 3), np.log(scale), np.float32),
+        np.broadcast_to(np.log(scale), (n, 3)).astype(np.float32),
         np.log(o / (1 - o)).astype(np.float32),
         np.zeros((n, 3), np.float32),
         np.zeros((n, 0, 3), np.float32),
@@ -51,7 +51,7 @@ def test_a_veil_goes_and_surfaces_stay():
     np.testing.assert_allclose(before, [0.4, 0, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(all_, [0.4, 0.54, 0.9, 0], rtol=1e-4)
     note = veils.remove_veils(state, iteration, **SETTINGS)
-    assert note == "1 stood before points that photographs show"
+    assert note == "1 stood before points that photographs show, 0 beside cameras"
     np.testing.assert_array_equal(state.gaussians.means, model.means[1:])
     assert len(state.adam.first.means) == 3
 
@@ -179,3 +179,49 @@ def test_256_rays_of_a_view_at_most_evenly_spread(monkeypatch, n, step, expected
     views = [iteration.scene.train_views[0]._replace(point_ids=np.arange(n))]
     veils.weigh_sight_lines(state, iteration._replace(scene=iteration.scene._replace(train_views=views)))
     assert seen == list(expected)
+
+
+# --- beside cameras ---
+
+AROUND = np.concatenate([POINTS, [[-1.0, 0.0, 5.0]]])  # the third nearest point is at sqrt(26): the ball has 2.55
+
+
+def setting_with_a_ball(model, step=600):
+    state, iteration = setting(model, step=step)
+    return state, iteration._replace(scene=iteration.scene._replace(points=AROUND))
+
+
+@pytest.mark.parametrize(("x", "scale", "n_left"), [(-2.5, 1e-3, 1), (-2.6, 1e-3, 2), (-2.6, 0.5, 2), (-2.6, 0.6, 1)])
+def test_a_gaussian_beside_a_camera_goes(x, scale, n_left):
+    """Outside its image, on no line of sight: 2.55^2 = 6.5 is above 2.5^2 = 6.25, 2.6^2 = 6.76 above 6.5 + 0.5^2."""
+    state, iteration = setting_with_a_ball(gaussians([[x, 0, 0], [0, 0, 5]], [0.9, 0.9], scale=[[scale], [0.1]]))
+    before, all_ = veils.weigh_sight_lines(state, iteration)
+    assert before[0] == all_[0] == 0
+    note = veils.remove_veils(state, iteration, **SETTINGS)
+    assert note == f"0 stood before points that photographs show, {2 - n_left} beside cameras"
+    assert len(state.gaussians.means) == len(state.adam.first.means) == n_left
+
+
+@pytest.mark.parametrize(("changes", "n_left"), [({}, 1), ({"clearance": 0.0}, 2), ({"start": 600}, 2)])
+def test_what_stays_beside_a_camera(changes, n_left):
+    state, iteration = setting_with_a_ball(gaussians([[-1, 0, 0], [0, 0, 5]], [0.9, 0.9]))
+    veils.remove_veils(state, iteration, **(SETTINGS | changes))
+    assert len(state.gaussians.means) == n_left
+
+
+def test_a_veil_beside_a_camera_is_counted_once():
+    state, iteration = setting_with_a_ball(gaussians([[0, 0, 2], [-1, 0, 0], [0, 0, 5]], [0.4, 0.4, 0.9]))
+    note = veils.remove_veils(state, iteration, **SETTINGS)
+    assert note == "1 stood before points that photographs show, 1 beside cameras"
+    assert len(state.gaussians.means) == 1
+
+
+@pytest.mark.parametrize(("spacing", "stays"), [(2.3, True), (2.7, False)])
+def test_a_wall_with_few_points_beside_a_camera(spacing, stays):
+    """A wall at 1 with points on a square grid: the nearest are at sqrt(1 + s^2 / 2), which is 2 with s = 2.45."""
+    x, y = spacing * (np.mgrid[-4:4, -4:4] + 0.5)
+    points = np.column_stack([x.ravel(), np.full(64, -1.0), y.ravel()])
+    wall = gaussians([[0, -1, 0], [0.5, -1, 3]], [0.9, 0.9], scale=np.array([[0.5, 1e-3, 0.5]] * 2))
+    state, iteration = setting(wall)
+    veils.remove_veils(state, iteration._replace(scene=iteration.scene._replace(points=points)), **SETTINGS)
+    assert (len(state.gaussians.means) == 2) == stays
