@@ -279,7 +279,7 @@ def test_the_recipe_trains_through_the_command_line(tmp_path, capsys):
     assert main(["synthetic", "staircase", "--out", str(tmp_path / "stairs"), *tiny]) == 0
     added = []
     for name, settings in (("tested", ()), ("untested", ("--set", "n_sources=0"))):
-        train = ["train", str(tmp_path / "stairs"), "--recipe", "mvg", "--iterations", "150"]
+        train = ["train", str(tmp_path / "stairs"), "--recipe", "mvg", "--iterations", "250"]
         assert main([*train, *settings, "--out", str(tmp_path / name)]) == 0
         events = [json.loads(line) for line in (tmp_path / name / "events.jsonl").read_text().splitlines()]
         own = [event for event in events if event["action"] == "insert_consistent"]

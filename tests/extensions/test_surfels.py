@@ -8,12 +8,14 @@ from numpy.testing import assert_allclose
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.surfels.discs import as_surfels
 from minisplat_ref.mechanisms.surfels.losses import distortion, median_normal_consistency, normal_consistency
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.losses import Rendered
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Camera, Gaussians, Model, RenderOutput, Scene, view_from
 from scenes import make_gaussians
 from tolerances import CLOSED_FORM
@@ -77,6 +79,23 @@ def test_surfels_start_flat_and_face_at_random(rng):
     assert surfels.quats.min() >= 0 and surfels.quats.max() <= 1  # as torch.rand draws them
     assert surfels.quats.mean() == pytest.approx(0.5, abs=0.03) and surfels.quats.dtype == g.quats.dtype
     assert (surfels.means == g.means).all()
+
+
+def test_a_setting_chooses_the_centre_of_the_low_pass():
+    """3 is the released one; a small disc that is turned and beside the axis has another with 0."""
+    recipe = find_recipe("surfels")
+    camera = Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 10.0, 8.0, 20, 16)
+    quat = np.array([[np.cos(0.4), 0, np.sin(0.4), 0]])
+    disc = Gaussians(np.array([[0.5, 0, 3.0]]), quat, np.log(np.full((1, 3), 0.8)), np.zeros(1), np.zeros((1, 3)), None)
+    disc = disc._replace(sh_rest=np.zeros((1, 0, 3)))
+    centers = []
+    for settings in ({}, {"low_pass_cutoff": 3.0}, {"low_pass_cutoff": 0.0}):
+        render = configure(recipe, **settings).representation.renderer.render
+        _, tape = render(Model(disc), view_from(camera), Request(conventions=GSPLAT_MAIN))
+        centers.append(tape.seen.surfels.means2d[0])
+    assert (centers[0] == centers[1]).all()
+    assert_allclose(centers[2], [10 + 20 * 0.5 / 3, 8], rtol=CLOSED_FORM)
+    assert abs(centers[0][0] - centers[2][0]) > 1
 
 
 @pytest.fixture(scope="module")

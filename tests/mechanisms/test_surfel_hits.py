@@ -10,7 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
-from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, project
+from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, RELEASED, project
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS, list_tiles
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.hits import tile_hits
@@ -104,6 +104,23 @@ def test_seen_from_its_edge_a_disc_is_its_low_pass(backend):
     output, _, _ = drawn(surfels_at([[0.0, 0.0, 4.0]], [EDGE_ON], [0.5], [0.9]), backend=backend)
     y, x = 8, 11
     assert_allclose(output.alpha[y, x], 0.9 * np.exp(-((x + 0.5 - 12.3) ** 2) - (y + 0.5 - 9.1) ** 2), rtol=SURFEL_HIT)
+
+
+@pytest.mark.parametrize("rules", [PAPER, RELEASED, GSPLAT])
+def test_the_centre_of_the_low_pass_by_hand(rules):
+    """A disc turned about y: its ends at u = -e and e are 5 - e sin and 5 + e sin away, and c is halfway between them.
+
+    One that reaches behind the camera with its three standard deviations, or one, has no box, except in gsplat.
+    """
+    sine, cosine, f, e = 0.6, 0.8, 30.0, {PAPER: 0.0, RELEASED: 3.0, GSPLAT: 1.0}[rules]
+    camera = Camera(np.eye(3), np.zeros(3), f, f, 12.0, 9.0, 24, 18)
+    quats = [[np.cos(np.arcsin(sine) / 2), 0, np.sin(np.arcsin(sine) / 2), 0]] * 2
+    g = surfels_at([[0.5, 0.2, 5.0]] * 2, quats, [0.7, 40.0], [0.9, 0.9])
+    found = project(activate(g), camera, GSPLAT_MAIN, rules).means2d
+    ends = [f * (0.5 + k * 0.7 * cosine) / (5.0 - k * 0.7 * sine) for k in (-e, e)]
+    assert_allclose(found[0, 0], 12 + np.mean(ends), rtol=CLOSED_FORM)
+    assert (abs(found[0, 0] - 15) > 0.1) == (e > 0)
+    assert (abs(found[1, 0] - 15) < 1e-9) == (rules != GSPLAT)
 
 
 @pytest.mark.parametrize("side", [-1, 1])

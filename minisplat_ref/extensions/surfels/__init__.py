@@ -23,8 +23,11 @@ the published dates (:mod:`minisplat_ref.mechanisms.surfels.losses`):
 ``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the released code as follows. A surfel reaches as far as its alpha can be 1/255 instead of three
-standard deviations. The loss on normals is the paper's sum over hits, whose derivative with respect to the opacity
-counts; the code holds that constant. Distortion has the square of the code, not the paper's absolute value.
+standard deviations. Where the low-pass is hit, the depth is that of the centre, not that at which the ray meets the
+plane, which has no bound for a disc seen from its edge. ``low_pass_cutoff`` is 3, as released; the paper's text has the
+projected centre, 0, and gsplat 1. The loss on normals is the paper's sum over hits, whose derivative with respect to
+the opacity counts; the code holds that constant. Distortion has the square of the code, not the paper's absolute value.
+Rates are those of ``3dgs-accel``.
 """
 
 from minisplat_ref.extensions.extension import Extension

@@ -10,7 +10,8 @@ half-extents (with ``k = (e^2, e^2, -1)``; * and / element by element)::
 
     d = sum(k M_w^2),   c_x = sum(k M_u M_w) / d,   h_x^2 = c_x^2 - sum(k M_u^2) / d,   likewise y from M_v
 
-The centre of the low-pass is c for e = 1, which is a little off the projected centre, in gsplat and here.
+The centre of the low-pass is c for an e of its own, a little off the projected centre, which is that of e = 0: the
+paper's text has the latter, the paper's code e = 3 and gsplat e = 1 (:class:`SurfelRules`).
 
 The third scale has no meaning and gets no gradient. Left out: the packed and sparse outputs of gsplat, which hold the
 same numbers.
@@ -40,11 +41,17 @@ class SurfelRules(NamedTuple):
     tile_size: int
     """Side of the square tiles, px, to which gsplat extends the reach of a surfel of ``GSPLAT_CUTOFF``; 0: a surfel
     reaches exactly as far as its alpha can be ``alpha_min``."""
+    low_pass_cutoff: float
+    """e, standard deviations: the low-pass is around the middle of the box of the disc of this radius."""
 
 
-PAPER = SurfelRules(has_hit_depths=True, drops_near_hits=True, tile_size=0)
-"""The paper's, without its cut at three standard deviations."""
-GSPLAT = SurfelRules(has_hit_depths=False, drops_near_hits=False, tile_size=16)
+PAPER = SurfelRules(has_hit_depths=True, drops_near_hits=True, tile_size=0, low_pass_cutoff=0.0)
+"""Those of the paper's text: the low-pass is around the projected centre."""
+RELEASED = PAPER._replace(low_pass_cutoff=3.0)
+"""Those of its code, without the cut at three standard deviations. A disc that reaches behind the camera has no box,
+and a low-pass around its projected centre. Where the low-pass is hit, the code takes the depth at which the ray meets
+the plane, which has no bound where a disc is seen from its edge; here it is the depth of the centre."""
+GSPLAT = SurfelRules(has_hit_depths=False, drops_near_hits=False, tile_size=16, low_pass_cutoff=1.0)
 """gsplat's ``rasterization_2dgs``."""
 
 
@@ -98,7 +105,7 @@ def project(
     primitives: Primitives,
     camera: Camera,
     conventions: Conventions,
-    rules: SurfelRules = PAPER,
+    rules: SurfelRules = RELEASED,
     radius_clip: float = 0.0,
 ) -> Surfels:
     """Project surfels into the image, and cull those that it cannot show.
@@ -116,14 +123,14 @@ def project(
     conventions : Conventions
         Near and far planes, principal point and ``alpha_min`` are used.
     rules : SurfelRules
-        ``PAPER`` or ``GSPLAT``.
+        ``PAPER``, ``RELEASED`` or ``GSPLAT``.
     radius_clip : float
         px.
     """
     camera = with_principal_point(camera, conventions)
     means, quats, scales, opacities = (field.astype(np.float64) for field in primitives)
     x, T = _transforms(means, quats, scales, camera)
-    c, h2, d = disc_boxes(T, np.ones(len(T)))
+    c, h2, d = disc_boxes(T, _low_pass_squares(T, rules))
     R, _ = pose(camera, means.dtype)
     n = rotation_matrices(quats)[:, :, 2] @ R.T
     n = np.where(np.sum(n * x, axis=1, keepdims=True) < 0, n, -n)
@@ -162,7 +169,7 @@ def project_vjp(
 ) -> PrimitiveGradient:
     """Gradient of :func:`project`; culled surfels get zeros.
 
-    With ``k = (1, 1, -1)``, ``v_d = -(v_cx c_x + v_cy c_y) / d`` and A = [s_0 R r_0, s_1 R r_1, x]::
+    With the k of the low-pass, ``v_d = -(v_cx c_x + v_cy c_y) / d`` and A = [s_0 R r_0, s_1 R r_1, x]::
 
         v_M_u += v_cx k M_w / d                              likewise v_M_v
         v_M_w += k (v_cx M_u + v_cy M_v) / d + 2 v_d k M_w
@@ -193,7 +200,7 @@ def project_vjp(
     x, T = _transforms(means, quats, scales, camera)
     v_T, v_c, v_o, v_depth, v_n = (np.asarray(field[rows], np.float64) for field in v_surfels)
 
-    v_A = np.swapaxes(_intrinsics(camera), 0, 1) @ (v_T + _centers_vjp(T, surfels.means2d[rows], v_c))
+    v_A = np.swapaxes(_intrinsics(camera), 0, 1) @ (v_T + _centers_vjp(T, surfels, rows, v_c))
     v_A[:, 2, 2] += v_depth
     turned = rotations[:, :, 2] @ R.T
     v_turned = np.where(np.sum(turned * x, axis=1, keepdims=True) < 0, v_n, -v_n)
@@ -240,9 +247,20 @@ def centers_moved(v_surfels: SurfelGradient, surfels: Surfels) -> Floats:
     return v_surfels.transforms[:, :2, 2] * surfels.depths[:, None] + v_surfels.means2d
 
 
-def _centers_vjp(T: Floats, c: Floats, v_c: Floats) -> Floats:
-    """Return the gradient [N, 3, 3] with respect to T via the centres c of the low-pass."""
-    k = np.array([1.0, 1.0, -1.0])
+def _low_pass_squares(T: Floats, rules: SurfelRules) -> Floats:
+    """Return e^2 [N] of the discs around whose boxes the low-pass is; 0 of one that would reach behind the camera.
+
+    gsplat has the same for all.
+    """
+    square = rules.low_pass_cutoff**2
+    is_in_front = square * np.sum(T[:, 2, :2] ** 2, axis=1) < T[:, 2, 2] ** 2
+    return np.where(is_in_front | (rules.tile_size > 0), square, 0.0)
+
+
+def _centers_vjp(T: Floats, surfels: Surfels, rows: Ints, v_c: Floats) -> Floats:
+    """Return the gradient [V, 3, 3] with respect to T of the visible rows, via the centres c of the low-pass."""
+    c, squares = surfels.means2d[rows], _low_pass_squares(T, surfels.rules)
+    k = np.column_stack([squares, squares, -np.ones_like(squares)])
     d = np.sum(k * T[:, 2] ** 2, axis=1)[:, None]
     v_T = np.empty_like(T)
     v_T[:, :2] = v_c[:, :, None] * (k * T[:, 2] / d)[:, None]

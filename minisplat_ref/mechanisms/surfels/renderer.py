@@ -1,5 +1,6 @@
 """A renderer of surfels, and its gradient: colours, normals, depths and the terms of the distortion as channels."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
 from minisplat_ref.mechanisms.surfels.kernels import response_for
 from minisplat_ref.mechanisms.surfels.projection import (
-    PAPER,
+    RELEASED,
     SurfelGradient,
     Surfels,
     centers_moved,
@@ -156,8 +157,8 @@ def channels(wants: frozenset[str]) -> dict[str, slice]:
     return slices
 
 
-def look(model: Model, view: View, request: Request) -> Seen:
-    """Return a population as the camera of a view sees it.
+def look(model: Model, view: View, request: Request, low_pass_cutoff: float = RELEASED.low_pass_cutoff) -> Seen:
+    """Return a population as the camera of a view sees it, by the released rules but for the cutoff of the low-pass.
 
     Raises
     ------
@@ -169,8 +170,11 @@ def look(model: Model, view: View, request: Request) -> Seen:
         raise InputError(f"surfels are drawn without {names}: train a recipe that does without")
     if request.conventions.is_antialiased:
         raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
-    primitives = activate(model.gaussians, request.is_visible)
-    surfels = project(primitives, view.camera, request.conventions, PAPER)
+    primitives, rules = (
+        activate(model.gaussians, request.is_visible),
+        RELEASED._replace(low_pass_cutoff=low_pass_cutoff),
+    )
+    surfels = project(primitives, view.camera, request.conventions, rules)
     return Seen(model.gaussians, primitives, view.camera, surfels)
 
 
@@ -254,7 +258,9 @@ def blend_vjp(tape: BlendTape, v_image: Floats, v_alpha: Floats | None) -> Blend
     )
 
 
-def render_surfels(model: Model, view: View, request: Request) -> tuple[RenderOutput, SurfelTape]:
+def render_surfels(
+    model: Model, view: View, request: Request, *, low_pass_cutoff: float = RELEASED.low_pass_cutoff
+) -> tuple[RenderOutput, SurfelTape]:
     """Render a view of surfels.
 
     Parameters
@@ -268,6 +274,8 @@ def render_surfels(model: Model, view: View, request: Request) -> tuple[RenderOu
         towards the camera; ``spread``, ``sum w q`` and ``sum w q^2`` of
         :class:`~minisplat_ref.mechanisms.surfels.response.Layout`; ``median``, the median depth as a channel with a
         gradient; ``median_depth``, the same in the output; ``stats`` and ``removal_changes`` of :class:`Request`.
+    low_pass_cutoff : float
+        Of :class:`.projection.SurfelRules`: 3 in the paper's code, 0 in its text, 1 in gsplat.
 
     Returns
     -------
@@ -279,7 +287,7 @@ def render_surfels(model: Model, view: View, request: Request) -> tuple[RenderOu
     InputError
         As :func:`look`.
     """
-    seen, g = look(model, view, request), model.gaussians
+    seen, g = look(model, view, request, low_pass_cutoff), model.gaussians
     sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     radii = seen.surfels.radii
     colors = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, seen.camera, sh_degree, radii)
@@ -305,5 +313,7 @@ def render_surfels_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None
     )
 
 
-SURFELS = Renderer("surfels", render_surfels, render_surfels_vjp, channels)
+SURFELS = Renderer(
+    "surfels", partial(render_surfels, low_pass_cutoff=RELEASED.low_pass_cutoff), render_surfels_vjp, channels
+)
 """2D Gaussian Splatting: any population that has the six fields of :class:`Gaussians`."""
