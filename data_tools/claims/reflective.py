@@ -153,6 +153,8 @@ def metal_of(gaussians: Gaussians, metallic: Floats | float = INFINITE, albedo: 
         albedo_logits=np.full((n, 3), np.log(albedo / (1 - albedo))),
         metallic_logits=np.broadcast_to(metallic, n).astype(float),
         roughness_logits=np.full(n, np.log(ROUGHNESS / (1 - ROUGHNESS))),
+        around_dc=np.zeros((n, 3)),
+        around_rest=np.zeros((n, 0)),
     )
 
 

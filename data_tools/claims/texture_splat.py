@@ -146,7 +146,12 @@ def cover(n: int, rng: np.random.Generator) -> ReflectiveSurfels:
     quats, scales = np.tile([1.0, 0, 0, 0], (m, 1)), np.full((m, 3), np.log(0.7 * spacing))
     gaussians = Gaussians(means, quats, scales, np.full(m, 4.0), np.zeros((m, 3)), np.zeros((m, 0, 3)))
     return ReflectiveSurfels(
-        **gaussians._asdict(), albedo_logits=np.zeros((m, 3)), metallic_logits=np.zeros(m), roughness_logits=np.zeros(m)
+        **gaussians._asdict(),
+        albedo_logits=np.zeros((m, 3)),
+        metallic_logits=np.zeros(m),
+        roughness_logits=np.zeros(m),
+        around_dc=np.zeros((m, 3)),
+        around_rest=np.zeros((m, 0)),
     )
 
 
@@ -174,8 +179,8 @@ def finest(n_floats: int, degree: int, rng: np.random.Generator) -> ReflectiveSu
 
 
 def floats_of(population: TexturedSurfels, degree: int) -> int:
-    """Return the floats of one surfel whose light from around has harmonics of a degree."""
-    return kit.count_floats(population) + 3 * ((degree + 1) ** 2 - 1)
+    """Return the floats of one surfel whose own colour and light from around have harmonics of a degree."""
+    return kit.count_floats(population) + 2 * 3 * ((degree + 1) ** 2 - 1)
 
 
 def render_maps(population: TexturedSurfels, camera: Camera) -> tuple[Floats, Floats]:

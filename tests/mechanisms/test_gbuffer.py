@@ -156,6 +156,30 @@ def test_a_mirror_shows_what_lies_behind_the_camera_and_what_is_in_the_way():
     assert_allclose(hidden[0], (S + B) * (0.25 * np.array([1.0, 2, 3]) + 0.75 * np.array([4.0, 0, 0])), rtol=1e-9)
 
 
+def test_light_that_is_scattered_otherwise_replaces_that_of_the_albedo():
+    """By hand: a quarter of metal leaves three quarters of the given light, whatever albedo and environment scatter."""
+    up, quarter = np.array([[0, 0, 1.0]]), np.full(1, 0.25)
+    surface, light = Surface(np.full((1, 3), 0.5), quarter, quarter, up, up), prefilter(np.ones((4, 8, 3)))
+    given, _ = shade(surface, light, scattered=np.array([[0.8, 0.4, 0.0]]))
+    plain, _ = shade(surface, light)
+    assert_allclose(given - plain, 0.75 * (np.array([[0.8, 0.4, 0.0]]) - 0.5), rtol=1e-9)
+
+
+def test_the_gradient_of_light_that_is_scattered_otherwise(rng):
+    surface, image = points(rng), rng.uniform(0.2, 1, size=(4, 8, 3))
+    given, cotangent = rng.uniform(size=(60, 3)), rng.normal(size=(60, 3))
+
+    def function(*args):
+        *fields, colors = args
+        return (shade(Surface(*fields), prefilter(image), scattered=colors)[0],)
+
+    _, tape = shade(surface, prefilter(image), scattered=given)
+    v = shade_vjp(tape, cotangent)
+    names = (*Surface._fields, "scattered")
+    check_inner_products(function, (*v.surface, v.scattered), (*surface, given), (cotangent,), rng, names=names)
+    assert not v.light.irradiance.any() and v.light.maps[0].any()
+
+
 def test_gradients_of_shading_reach_the_texels(rng):
     surface, image = points(rng), rng.uniform(0.2, 1, size=(4, 8, 3))
     visible, around = rng.uniform(size=60), rng.uniform(size=(60, 3))

@@ -5,17 +5,21 @@ Gaussian Splatting has an albedo a, a metallic share m and a roughness. Blended 
 shaded once by an environment in latitude and longitude, whose texels are learned
 (:mod:`minisplat_ref.mechanisms.gbuffer`):
 
-    c = a (1 - m) E(n) + (F_0 S + B) L,   F_0 = 0.04 (1 - m) + a m,   L = V L_env(r, roughness) + (1 - V) L_around
+    c = (1 - m) D + (F_0 S + B) L,   F_0 = 0.04 (1 - m) + a m,   L = V L_env(r, roughness) + (1 - V) L_around
 
 r is the reflected ray, V the fraction of the environment that it sees past the surfels, and L_around the light that
-each surfel receives from around instead, its spherical harmonics in the direction r. Training has three stages:
+each surfel receives from around instead, harmonics in the direction r. D is what a surfel scatters: shaded by itself
+the albedo in the environment, a E(n), and per pixel, as in the released code, the surfel's own colour, harmonics of the
+viewing direction as in 3DGS. So another environment changes what is reflected, and not what is scattered. Training has
+three stages, of 50,000 iterations:
 
     1        each surfel is shaded by itself and then blended, which is more forgiving while normals are wrong
-    18,000   shading per pixel
+    18,000   shading per pixel; materials and light begin once more
     20,000   and with occlusion
 
-Every 1,000 iterations of the first, surfels that mirror grow by half, and others are disturbed, so that the normals of
-mirrors spread (:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on normals is that of 2D Gaussian Splatting.
+Up to 25,000 surfels are densified every 500 iterations, and every 1,000 all become nearly opaque, those that mirror
+grow by half, and once pixels are shaded the colours of others are disturbed, so that the normals of mirrors spread
+(:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on normals is that of 2D Gaussian Splatting.
 
     minisplat-ref train SCENE --recipe reflective --out runs/reflective
     minisplat-ref render runs/reflective --map normal
@@ -25,11 +29,14 @@ mirrors spread (:mod:`minisplat_ref.mechanisms.gbuffer.training`). The loss on n
 
 ``docs/FAMILY.md`` has the measured figures.
 
-This deviates from the paper as follows. Reflected rays meet the surfels, not a mesh that is extracted now and then, and
-V is their transmittance. The environment has 32 x 64 texels; its averages are exact matrices instead of samples, and
-nine harmonics hold the light on a matte surface. The date of occlusion, the strength of the disturbance and what counts
-as a mirror are ours. Light is linear and shown as sRGB. Left out are light that is reflected twice, and the environment
-as the background of the image.
+Dates, rates and thresholds are those of the released code. This deviates from it as follows. Reflected rays meet the
+surfels, not a mesh that is extracted now and then, and V is their transmittance. The environment has 32 x 64 texels
+without an upper limit; its averages are exact matrices instead of samples, and nine harmonics hold the light on a matte
+surface. Light is linear and shown as sRGB, which is an option there. The albedo begins with the colours of the points
+instead of grey. Shaded by themselves, surfels have shares S and B of their own; the code gives all of them those of the
+first, which we take for a mistake. Opacities are trained right after they have been raised, not 200 iterations later,
+and resets of opacities leave the metallic share as it is. Adam is that of ``3dgs-accel``. Left out are light that is
+reflected twice, and the environment as the background of the image.
 """
 
 from minisplat_ref.extensions.extension import Extension

@@ -16,8 +16,14 @@ from minisplat_ref.mechanisms.gbuffer.population import (
     with_materials,
 )
 from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render_reflective
-from minisplat_ref.mechanisms.gbuffer.training import NORMALS, SHADING_EVENTS, SHADING_RATES
-from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS
+from minisplat_ref.mechanisms.gbuffer.training import (
+    ITERATIONS,
+    NORMALS,
+    OWN_RATES,
+    SH_MILESTONES,
+    SHADING_EVENTS,
+    SHADING_RATES,
+)
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
@@ -34,7 +40,12 @@ SHADED = Representation(
 )
 
 RECIPE = GS_ACCEL._replace(
-    name="reflective", losses=(*GS_ACCEL.losses, NORMALS), events=(*DISC_EVENTS, *SHADING_EVENTS)
+    name="reflective",
+    iterations=ITERATIONS,
+    learning_rates=GS_ACCEL.learning_rates.change(**OWN_RATES),
+    sh_milestones=SH_MILESTONES,
+    losses=(*GS_ACCEL.losses, NORMALS),
+    events=SHADING_EVENTS,
 )
 """``reflective``: surfels shaded one by one up to iteration 18,000, then pixel by pixel, in the end with occlusion."""
 
@@ -50,5 +61,5 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
         render=partial(render_reflective, mirrors=True),
         shaded=lambda tape: tape,
     )
-    per_surfel = stage_of(PER_SURFEL, fixed=("sh_dc", "sh_rest"))
+    per_surfel = stage_of(PER_SURFEL, fixed=("sh_dc", "sh_rest", "around_dc", "around_rest"))
     return per_surfel._replace(name="render, shaded surfel by surfel"), stage_of(WITH_OCCLUSION)

@@ -29,7 +29,6 @@ from minisplat_ref.extensions.texture_splat.textures import (
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.mechanisms.gbuffer import renderer as shaded
 from minisplat_ref.mechanisms.gbuffer.gradient_checks import shading_stage
-from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     STAGE,
@@ -39,6 +38,7 @@ from minisplat_ref.mechanisms.gbuffer.population import (
     with_materials,
 )
 from minisplat_ref.mechanisms.gbuffer.population import first_light as first_light_of_reflective
+from minisplat_ref.mechanisms.gbuffer.training import NORMALS, OWN_RATES, SHADING_RATES
 from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.renderer import Shown
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
@@ -57,18 +57,8 @@ from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, Scene, V
 CHANNELS = {"metallic_logits": 1, "roughness_logits": 1, "albedo_logits": 3, "normal_textures": 2}
 """The textures, and the number of channels of each."""
 
-TEXELS = 2  # along each side of a texture, as published
-RATES = Rates(
-    {
-        "normal_textures": 0.01,
-        "albedo_logits": 0.01,
-        "metallic_logits": 0.01,
-        "roughness_logits": 0.01,
-        ENVIRONMENT: 0.01,
-        STAGE: 0.0,
-    },
-    frozenset(),
-)
+TEXELS = 4  # along each side of a texture, as released
+RATES = SHADING_RATES.join(Rates({"normal_textures": 1e-3}, frozenset()))
 
 CHECKED_TEXELS = 3  # the smallest texture that has a kink inside
 
@@ -90,6 +80,8 @@ class TexturedSurfels(NamedTuple):
     """[N, T^2]."""
     roughness_logits: Floats
     """[N, T^2]."""
+    around_dc: Floats
+    around_rest: Floats
 
 
 def count_texels(population: Any) -> int:
@@ -134,6 +126,8 @@ def with_textures(
         albedo_logits=g.albedo_logits,
         metallic_logits=g.metallic_logits[:, None],
         roughness_logits=g.roughness_logits[:, None],
+        around_dc=g.around_dc,
+        around_rest=g.around_rest,
     )
     return resize_textures(flat, texels)
 
@@ -242,7 +236,9 @@ def read_textures_vjp(seen: discs.Seen, v_texels: Floats) -> shaded.MaterialGrad
     )
 
 
-def blend(seen: discs.Seen, colors: Floats, texels: Floats, request: Request) -> tuple[RenderOutput, TextureTape]:
+def blend(
+    seen: discs.Seen, colors: Floats, texels: Floats, further: Floats, request: Request
+) -> tuple[RenderOutput, TextureTape]:
     """Blend surfels with textures; see :func:`minisplat_ref.mechanisms.surfels.renderer.blend`.
 
     Parameters
@@ -251,13 +247,15 @@ def blend(seen: discs.Seen, colors: Floats, texels: Floats, request: Request) ->
         As there; the request wants normals.
     texels : ndarray of shape (N, T^2, 8)
         From :func:`read_textures`.
+    further : ndarray of shape (N, K)
+        What else each surfel brings along, the same for all of its points.
     """
     if texels.shape[1] == 1:
         flat = seen._replace(surfels=seen.surfels._replace(normals=texels[:, 0, :3]))
-        output, tape = discs.blend(flat, colors, texels[:, 0, 3:], request)
+        output, tape = shaded.blend_flat(flat, colors, texels[:, 0, 3:], further, request)
         return output, TextureTape(tape, texels, np.zeros((0, 0, N_CHANNELS)))
     # As many channels as without textures, so that the same kernel blends the others.
-    output, tape = discs.blend(seen, colors, np.zeros_like(texels[:, 0, 3:]), request)
+    output, tape = shaded.blend_flat(seen, colors, np.zeros_like(texels[:, 0, 3:]), further, request)
     image = choose_twin(request.backend).blend_texels(tape.shown.surfels, texels, tape.shown.bins, request.conventions)
     mixed = output.image.copy()
     for part, values in zip(_parts(tape), (image[:, :, :3], image[:, :, 3:]), strict=True):
@@ -265,16 +263,17 @@ def blend(seen: discs.Seen, colors: Floats, texels: Floats, request: Request) ->
     return output._replace(image=mixed), TextureTape(tape, texels, image)
 
 
-def blend_vjp(tape: TextureTape, v_image: Floats, v_alpha: Floats | None) -> discs.BlendedGradient:
+def blend_vjp(tape: TextureTape, v_image: Floats, v_alpha: Floats | None) -> tuple[discs.BlendedGradient, Floats]:
     """Gradient of :func:`blend`; ``carried`` is that of the texels. Both blends add to the gradient of the surfels."""
     if tape.texels.shape[1] == 1:
-        v = discs.blend_vjp(tape.discs, v_image, v_alpha)
+        v, v_further = shaded.blend_flat_vjp(tape.discs, v_image, v_alpha)
         v_texels = np.column_stack([v.surfels.normals, v.carried])[:, None]
-        return v._replace(surfels=v.surfels._replace(normals=np.zeros_like(v.surfels.normals)), carried=v_texels)
+        flat = v.surfels._replace(normals=np.zeros_like(v.surfels.normals))
+        return v._replace(surfels=flat, carried=v_texels), v_further
     shown, parts, others = tape.shown, _parts(tape.discs), v_image.copy()
     for part in parts:
         others[:, :, part] = 0
-    v = discs.blend_vjp(tape.discs, others, v_alpha)
+    v, v_further = shaded.blend_flat_vjp(tape.discs, others, v_alpha)
     v_T, v_c, v_o, v_texels = choose_twin(shown.backend).blend_texels_vjp(
         shown.surfels,
         tape.texels,
@@ -284,10 +283,8 @@ def blend_vjp(tape: TextureTape, v_image: Floats, v_alpha: Floats | None) -> dis
         np.concatenate([v_image[:, :, part] for part in parts], axis=2),
     )
     s = v.surfels
-    return v._replace(
-        surfels=s._replace(transforms=s.transforms + v_T, means2d=s.means2d + v_c, opacities=s.opacities + v_o),
-        carried=v_texels,
-    )
+    moved = s._replace(transforms=s.transforms + v_T, means2d=s.means2d + v_c, opacities=s.opacities + v_o)
+    return v._replace(surfels=moved, carried=v_texels), v_further
 
 
 TEXTURES = shaded.Materials(read_textures, read_textures_vjp, blend, blend_vjp)
@@ -341,7 +338,11 @@ TEXTURED_SURFELS = Representation(
     extends=frozenset({"reflective surfels", "textured surfels"}),
 )
 
-RECIPE = FINE_TUNING._replace(name="texture-splat", learning_rates=FINE_TUNING.learning_rates.change(means=0.0))
+RECIPE = FINE_TUNING._replace(
+    name="texture-splat",
+    learning_rates=FINE_TUNING.learning_rates.change(means=0.0, **OWN_RATES),
+    losses=(*FINE_TUNING.losses, NORMALS),
+)
 """``texture-splat``: 30,000 iterations on a finished run; centres and their number stay, everything else is trained."""
 
 

@@ -3,11 +3,13 @@
 A camera with the pose R, t sees the surfel at ``x = R mu + t`` along ``d = x / |x|``. Its normal n, in the camera's
 frame, reflects that to ``r = d - 2 (d.n) n``, and in the world the light from there is::
 
-    max(0, 1/2 + sum_k c_k Y_k(R^T r))
+    max(0, sum_k c_k Y_k(R^T r))
 
-with the coefficients of the surfel's spherical harmonics, of which 3DGS makes the colour along d.
+with coefficients that are 0 at the start. There the maximum has the gradient of the sum, as in the released code;
+otherwise no light would ever come from around.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -45,33 +47,36 @@ def sight_of(means: Floats, normals: Floats, pose: tuple[Floats, Floats]) -> Sig
     return Sight(x, x / np.linalg.norm(x, axis=1, keepdims=True), normals, R)
 
 
-def light_around(sight: Sight, coefficients: Floats, degree: int) -> Floats:
+def light_around(sight: Sight, coefficients: Floats) -> Floats:
     """Return the light [M, 3] that surfels of ``coefficients`` [M, K, 3] receive from around, linear RGB."""
-    basis = sh_basis(_reflected(sight) @ sight.R, degree)
-    return np.maximum(0, 0.5 + np.einsum("mk,mkc->mc", basis, coefficients[:, : basis.shape[1]]))
+    basis = sh_basis(_reflected(sight) @ sight.R, degree_of(coefficients))
+    return np.maximum(0, np.einsum("mk,mkc->mc", basis, coefficients))
 
 
-def light_around_vjp(sight: Sight, coefficients: Floats, degree: int, v_light: Floats) -> AroundGradient:
+def degree_of(coefficients: Floats) -> int:
+    """Return the degree of harmonics of ``coefficients`` [M, K, 3]."""
+    return math.isqrt(coefficients.shape[1]) - 1
+
+
+def light_around_vjp(sight: Sight, coefficients: Floats, v_light: Floats) -> AroundGradient:
     """Gradient of :func:`light_around`.
 
     ::
 
-        v_c_k = Y_k v,   v_w = sum_k (c_k . v) dY_k/dw      w = R^T r; v is v_light where the light is positive, else 0
+        v_c_k = Y_k v,   v_w = sum_k (c_k . v) dY_k/dw      w = R^T r; v is 0 where the sum is negative, else v_light
         v_r   = R v_w,   v_R = sum r v_w^T
         v_n   = -2 ((d.n) v_r + (n.v_r) d),   v_d = v_r - 2 (n.v_r) n,   v_x = (v_d - d (d.v_d)) / |x|
     """
     r, (x, d, n, R) = _reflected(sight), sight
     w = r @ R
+    degree = degree_of(coefficients)
     basis = sh_basis(w, degree)
-    active = coefficients[:, : basis.shape[1]]
-    v = np.where(0.5 + np.einsum("mk,mkc->mc", basis, active) > 0, v_light, 0)
-    v_coefficients = np.zeros_like(coefficients)
-    v_coefficients[:, : basis.shape[1]] = basis[:, :, None] * v[:, None, :]
-    v_w = np.einsum("mk,mki->mi", np.einsum("mkc,mc->mk", active, v), sh_basis_jacobian(w, degree))
+    v = np.where(np.einsum("mk,mkc->mc", basis, coefficients) >= 0, v_light, 0)
+    v_w = np.einsum("mk,mki->mi", np.einsum("mkc,mc->mk", coefficients, v), sh_basis_jacobian(w, degree))
     v_r = v_w @ R.T
     d_n, n_v = np.sum(d * n, axis=1, keepdims=True), np.sum(n * v_r, axis=1, keepdims=True)
     return AroundGradient(
-        coefficients=v_coefficients,
+        coefficients=basis[:, :, None] * v[:, None, :],
         x=towards_vjp(x, d, v_r - 2 * n_v * n),
         normals=-2 * (d_n * v_r + n_v * d),
         R=r.T @ v_w,

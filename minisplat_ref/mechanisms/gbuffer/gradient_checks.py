@@ -12,7 +12,7 @@ from minisplat_ref.mechanisms.gbuffer.environment import locate
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import STAGE
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS
-from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficients
+from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficients, has_own_colors
 from minisplat_ref.mechanisms.gbuffer.shading import ShadingTape
 from minisplat_ref.mechanisms.gbuffer.tone import KNEE
 from minisplat_ref.mechanisms.surfels import gradient_checks as of_surfels
@@ -79,9 +79,11 @@ def shading_stage(
 
     def sides(drawn: Drawn) -> list[np.ndarray]:
         tape = shaded(drawn.tape)
-        is_lit = light_around(tape.sight, coefficients(drawn.model.gaussians, tape.rows), tape.degree) > 0
-        own = further(drawn)
-        return [*of_surfels.sides_of(tape.blend.shown), *sides_of(tape.shading, tape.linear), is_lit, *own]
+        g, own = drawn.model.gaussians, list(further(drawn))
+        if has_own_colors(g):
+            own.append(light_around(tape.sight, coefficients(g, tape.rows)) > 0)
+            own.append(tape.blend.shown.colors[:, :3] > 0)  # own colours
+        return [*of_surfels.sides_of(tape.blend.shown), *sides_of(tape.shading, tape.linear), *own]
 
     def shared(scene: Scene, rng: np.random.Generator) -> dict[str, Floats]:
         first = dict(representation.shared(scene, rng))

@@ -1,9 +1,13 @@
 """Rendering of reflective surfels: shaded one by one and then blended, or blended and then shaded pixel by pixel.
 
 The shared parameter ``shading_stage`` selects which (:mod:`.population`). Per surfel, each has a colour, which is
-blended as in 2D Gaussian Splatting. Per pixel, materials, normals and the light from around are blended::
+blended as in 2D Gaussian Splatting. Per pixel, materials, normals, own colours and the light from around are blended::
 
     X = sum_i w_i x_i / A,   n = sum_i w_i n_i / |sum_i w_i n_i|,   image = A tone(shade(X, n)) + (1 - A) background
+
+An own colour is what harmonics make of the viewing direction, as in 3DGS, but linear; per pixel it takes the place of
+what the albedo scatters of the environment, as in the released code. A population without ``around_dc`` has neither it
+nor light from around.
 
 with the accumulated opacity A. With occlusion, ``1 - V`` is the opacity of the surfels along the reflected ray, from
 the expected depth of the pixel on (:mod:`minisplat_ref.mechanisms.gbuffer.visibility`).
@@ -45,6 +49,7 @@ from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGra
 
 MAPS = {"albedo": 3, "metallic": 1, "roughness": 1}
 """The material's channels, in the order in which surfels carry them."""
+N_MATERIAL = sum(MAPS.values())
 RAY_START = 0.02  # of the pixel's depth: where a reflected ray begins, so that it misses its own surface
 GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
 
@@ -60,19 +65,36 @@ class MaterialGradient(NamedTuple):
     """[3, 3]."""
 
 
+def blend_flat(
+    seen: discs.Seen, colors: Floats, carried: Floats, further: Floats, request: Request
+) -> tuple[RenderOutput, discs.BlendTape]:
+    """Blend surfels that each have one material; see :func:`minisplat_ref.mechanisms.surfels.renderer.blend`."""
+    return discs.blend(seen, colors, np.column_stack([carried, further]), request)
+
+
+def blend_flat_vjp(
+    tape: discs.BlendTape, v_image: Floats, v_alpha: Floats | None
+) -> tuple[discs.BlendedGradient, Floats]:
+    """Gradient of :func:`blend_flat`: of everything but ``further``, and of that."""
+    v = discs.blend_vjp(tape, v_image, v_alpha)
+    return v._replace(carried=v.carried[:, :N_MATERIAL]), v.carried[:, N_MATERIAL:]
+
+
 class Materials(NamedTuple):
     """The materials of surfels: one for a whole surfel, as :data:`FLAT`, or another one at each of its points.
 
-    The functions of blending are those of :mod:`minisplat_ref.mechanisms.surfels.renderer`, or take ``carried`` in
-    another form; a tape has ``shown``, and normals and materials are in the same channels.
+    The functions of blending are those of :mod:`minisplat_ref.mechanisms.surfels.renderer` with ``further`` beside
+    ``carried``, which may have another form; a tape has ``shown``, and normals and materials are in the same channels.
     """
 
     carried: Callable[[discs.Seen], Any]
     """The materials of the surfels of a view, as ``blend`` takes them."""
     carried_vjp: Callable[[discs.Seen, Any], MaterialGradient]
     """Gradient of ``carried``."""
-    blend: Callable[..., tuple[RenderOutput, Any]] = discs.blend
-    blend_vjp: Callable[..., discs.BlendedGradient] = discs.blend_vjp
+    blend: Callable[..., tuple[RenderOutput, Any]] = blend_flat
+    """``blend(seen, colors, carried, further, request)``: the channels of ``further`` [N, K] follow the materials."""
+    blend_vjp: Callable[..., tuple[discs.BlendedGradient, Floats]] = blend_flat_vjp
+    """Gradient of ``blend``, and that with respect to ``further``."""
 
 
 class _Pixels(NamedTuple):
@@ -80,7 +102,7 @@ class _Pixels(NamedTuple):
 
     rows: Ints  # [P] y W + x
     alpha: Floats  # [P] A
-    blended: Floats  # [P, 3 + 3 + 5] sums: light from around, normals, materials
+    blended: Floats  # [P, 3 + 3 + 5 + K] sums: own colours, normals, materials, and the 0 or 3 of light from around
     lengths: Floats  # [P, 1] of the summed normals
     to_camera: Floats  # [P, 3] camera frame
 
@@ -94,7 +116,7 @@ class ReflectiveTape(NamedTuple):
     blend: Any  # tape of the materials' ``blend``
     rows: Ints  # [M] visible surfels
     sight: Sight
-    degree: int
+    sh_degree: int | Ints  # of own colours
     shading: ShadingTape
     linear: Floats  # [M or P, 3] colours before the tone curve
     environment: Floats  # [H, 2 H, 3]
@@ -168,7 +190,7 @@ def render_reflective(
     rows = np.flatnonzero(seen.surfels.radii[:, 0] > 0)
     camera = with_principal_point(view.camera, request.conventions)
     sight = sight_of(g.means[rows], seen.surfels.normals[rows].astype(dtype), pose(camera, dtype))
-    degree = int(np.max(choose_degree(g.sh_rest, request.sh_degree), initial=0))
+    sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     environment = np.exp(model.shared[ENVIRONMENT].astype(dtype))
     light, carried, colors = prefilter(environment), materials.carried(seen), np.zeros_like(g.means)
     slices = discs.channels(own.wants)
@@ -179,20 +201,26 @@ def render_reflective(
         output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
         image, pixels = output.image, None
     else:
-        colors[rows] = light_around(sight, coefficients(g, rows), degree)
-        output, tape = materials.blend(seen, colors, carried, own._replace(background=None))
+        further = np.zeros_like(g.means) if has_own_colors(g) else g.means[:, :0]
+        if has_own_colors(g):
+            radii = seen.surfels.radii
+            colors = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, seen.camera, sh_degree, radii)
+            further[rows] = light_around(sight, coefficients(g, rows))
+        output, tape = materials.blend(seen, colors, carried, further, own._replace(background=None))
         pixels = _pixels(output, slices, camera, request)
         n_world = pixels.blended[:, 3:6] / pixels.lengths @ sight.R
         X = pixels.blended / pixels.alpha[:, None]
-        surface = _surface(X[:, 6:], n_world, pixels.to_camera @ sight.R)
-        around = None
-        if stage >= WITH_OCCLUSION:
+        surface = _surface(X[:, 6:11], n_world, pixels.to_camera @ sight.R)
+        around = scattered = None
+        if has_own_colors(g):
+            scattered = np.ascontiguousarray(X[:, :3])
+        if stage >= WITH_OCCLUSION and has_own_colors(g):
             if visibility is None:
                 sees = _visibility(surface, output, pixels, seen, request)
             else:
                 sees = visibility.ravel()[pixels.rows]
-            around = Around(sees, np.ascontiguousarray(X[:, :3]))
-        linear, shading = shade(surface, light, around, mirrors)
+            around = Around(sees, np.ascontiguousarray(X[:, 11:]))
+        linear, shading = shade(surface, light, around, mirrors, scattered)
         background = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
         image = output.image.copy()
         image[:, :, :3] = background
@@ -205,7 +233,7 @@ def render_reflective(
             wanted.append(image[:, :, first + at : first + at + size])
     output = output._replace(image=np.ascontiguousarray(np.concatenate(wanted, axis=2)))
     return output, ReflectiveTape(
-        model, seen, request, tape, rows, sight, degree, shading, linear, environment, pixels, slices, materials
+        model, seen, request, tape, rows, sight, sh_degree, shading, linear, environment, pixels, slices, materials
     )
 
 
@@ -231,8 +259,10 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         v = shade_vjp(tape.shading, tone_vjp(tape.linear, A * v_seen))
         v_X = np.zeros_like(p.blended)
         v_X[:, 6:9], v_X[:, 9], v_X[:, 10] = v.surface.albedo, v.surface.metallic, v.surface.roughness
+        if v.scattered is not None:
+            v_X[:, :3] = v.scattered
         if v.around is not None:
-            v_X[:, :3] = v.around
+            v_X[:, 11:] = v.around
         v_alpha.ravel()[p.rows] += np.sum(v_seen * (tone(tape.linear) - behind), axis=1)
         v_alpha.ravel()[p.rows] -= np.sum(v_X * p.blended, axis=1) / p.alpha**2
         n = p.blended[:, 3:6] / p.lengths
@@ -245,15 +275,23 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         flat[p.rows, :3] = v_X[:, :3]
         flat[p.rows, tape.slices["normal"]] += v_X[:, 3:6]
         flat[p.rows, first:] += v_X[:, 6:]
-    v_blend = tape.materials.blend_vjp(tape.blend, v_sums, v_alpha)
-    v_coefficients = np.zeros((len(tape.rows), 1 + g.sh_rest.shape[1], 3), dtype)
+    zero = np.zeros((3, 3), dtype)
+    v_sh = SHGradient(np.zeros_like(g.means), np.zeros_like(g.sh_dc), np.zeros_like(g.sh_rest), zero, zero[0])
+    v_fields: dict[str, Floats] = {}
     if tape.pixels is not None:
-        v_carried, v_light = v_blend.carried, v_blend.colors[tape.rows]
-        v_around = light_around_vjp(tape.sight, coefficients(g, tape.rows), tape.degree, v_light)
-        v_coefficients, v_x, v_normals = v_around.coefficients, v_around.x, v_around.normals
-        v_R = v_R + v_around.R
+        v_blend, v_further = tape.materials.blend_vjp(tape.blend, v_sums, v_alpha)
+        v_carried = v_blend.carried
+        if has_own_colors(g):
+            radii = tape.seen.surfels.radii
+            v_sh = request.backend.sh_colors_vjp(
+                g.means, g.sh_dc, g.sh_rest, tape.seen.camera, tape.sh_degree, radii, v_blend.colors
+            )
+            v_around = light_around_vjp(tape.sight, coefficients(g, tape.rows), v_further[tape.rows])
+            v_fields = _coefficients_vjp(g, tape.rows, v_around.coefficients)
+            v_x, v_normals, v_R = v_around.x, v_around.normals, v_R + v_around.R
     else:
-        v_background, v_carried = v_blend.background, np.zeros((len(g.means), 5), dtype)
+        v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
+        v_background, v_carried = v_blend.background, np.zeros((len(g.means), N_MATERIAL), dtype)
         v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
         v = shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
         v_carried[tape.rows, :3] += v.surface.albedo
@@ -262,7 +300,9 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         v_normals = v.surface.normals @ R.T
         v_x = towards_vjp(tape.sight.x, tape.sight.d, -v.surface.to_camera @ R.T)
         v_R = tape.sight.normals.T @ v.surface.normals - tape.sight.d.T @ v.surface.to_camera
-    return _parameters_vjp(tape, v_blend.surfels, (v_x, v_normals, v_R), (v_coefficients, v_carried))._replace(
+    v_all = _parameters_vjp(tape, v_blend.surfels, (v_x, v_normals, v_R), v_sh, v_carried)
+    return v_all._replace(
+        gaussians=v_all.gaussians._replace(**v_fields),
         background=v_background.astype(dtype),
         shared={
             ENVIRONMENT: (tape.environment * prefilter_vjp(tape.environment, v.light)).astype(dtype),
@@ -272,30 +312,32 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
 
 
 def _parameters_vjp(
-    tape: ReflectiveTape, v: SurfelGradient, of_sight: tuple[Floats, Floats, Floats], of_fields: tuple[Floats, Floats]
+    tape: ReflectiveTape,
+    v: SurfelGradient,
+    of_sight: tuple[Floats, Floats, Floats],
+    v_sh: SHGradient,
+    v_carried: Any,
 ) -> RenderGradient:
     """Return the gradient with respect to population and pose, without those of background and shared parameters."""
     g, rows, (v_x, v_normals, v_R) = tape.model.gaussians, tape.rows, of_sight
-    v_coefficients, v_carried = of_fields
     all_normals = v.normals.copy()
     all_normals[rows] += v_normals
     v = v._replace(normals=all_normals)
     v_primitives = project_vjp(tape.seen.primitives, tape.seen.camera, tape.request.conventions, tape.seen.surfels, v)
-    v_means, v_sh_dc, v_sh_rest = np.zeros_like(g.means), np.zeros_like(g.sh_dc), np.zeros_like(g.sh_rest)
-    v_means[rows], v_sh_dc[rows], v_sh_rest[rows] = v_x @ tape.sight.R, v_coefficients[:, 0], v_coefficients[:, 1:]
-    v_R = v_R + v_x.T @ g.means[rows]
-    zero = np.zeros((3, 3), g.means.dtype)
+    v_means = v_sh.means.copy()
+    v_means[rows] += v_x @ tape.sight.R
+    v_R = v_R + v_x.T @ g.means[rows] + v_sh.cam_from_world_R
     v_materials = tape.materials.carried_vjp(tape.seen, v_carried)
     v_primitives = v_primitives._replace(quats=v_primitives.quats + v_materials.quats)
     v_R = v_R + v_materials.cam_from_world_R
-    of_six = parameters_vjp(
-        g, tape.seen.primitives, v_primitives, SHGradient(v_means, v_sh_dc, v_sh_rest, zero, zero[0])
-    )
+    of_six = parameters_vjp(g, tape.seen.primitives, v_primitives, v_sh._replace(means=v_means))
     return RenderGradient(
         gaussians=of_six._replace(**v_materials.fields),
-        background=zero[0],
+        background=np.zeros(3, g.means.dtype),
         cam_from_world_R=(v_primitives.cam_from_world_R + v_R).astype(g.means.dtype),
-        cam_from_world_t=(v_primitives.cam_from_world_t + v_x.sum(axis=0)).astype(g.means.dtype),
+        cam_from_world_t=(v_primitives.cam_from_world_t + v_x.sum(axis=0) + v_sh.cam_from_world_t).astype(
+            g.means.dtype
+        ),
         means2d=centers_moved(v, tape.seen.surfels).astype(g.means.dtype),
     )
 
@@ -304,9 +346,22 @@ def _surface(carried: Floats, normals: Floats, to_camera: Floats) -> Surface:
     return Surface(np.ascontiguousarray(carried[:, :3]), carried[:, 3], carried[:, 4], normals, to_camera)
 
 
+def has_own_colors(g: Any) -> bool:
+    """Return whether surfels have own colours, and light from around, for shading per pixel."""
+    return "around_dc" in g._fields
+
+
 def coefficients(g: ReflectiveSurfels, rows: Ints) -> Floats:
     """Return the coefficients [M, K, 3] of the light from around."""
-    return np.concatenate([g.sh_dc[rows, None], g.sh_rest[rows]], axis=1)
+    rest = g.around_rest[rows].reshape(len(rows), g.around_rest.shape[1] // 3, 3)
+    return np.concatenate([g.around_dc[rows, None], rest], axis=1)
+
+
+def _coefficients_vjp(g: ReflectiveSurfels, rows: Ints, v_coefficients: Floats) -> dict[str, Floats]:
+    """Gradient of :func:`coefficients`, by field."""
+    v_dc, v_rest = np.zeros_like(g.around_dc), np.zeros_like(g.around_rest)
+    v_dc[rows], v_rest[rows] = v_coefficients[:, 0], v_coefficients[:, 1:].reshape(len(rows), v_rest.shape[1])
+    return {"around_dc": v_dc, "around_rest": v_rest}
 
 
 def _pixels(output: RenderOutput, slices: dict[str, slice], camera: Camera, request: Request) -> _Pixels:
@@ -338,8 +393,10 @@ def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
     """Return the derivative with respect to the blended values from that of the requested channels."""
     blended, maps = tape.slices, tape.request.wants & MAPS.keys()
     first = max(part.stop for part in blended.values())
-    has_carried = tape.pixels is not None or bool(maps)
-    v = np.zeros((*v_image.shape[:2], first + (5 if has_carried else 0)), v_image.dtype)
+    n_carried = N_MATERIAL if tape.pixels is not None or maps else 0
+    if tape.pixels is not None:
+        n_carried = tape.pixels.blended.shape[1] - 6
+    v = np.zeros((*v_image.shape[:2], first + n_carried), v_image.dtype)
     for name, part in channels(tape.request.wants).items():
         if name in MAPS:
             at = first + {"albedo": 0, "metallic": 3, "roughness": 4}[name]
