@@ -15,6 +15,7 @@ from minisplat_ref.extensions.discretized_sdf.model import (
     LOG_WIDTH,
     WIDTH,
     _foreground,
+    first_shared,
     opacity_logits,
     opacity_logits_vjp,
     projected,
@@ -27,10 +28,11 @@ from minisplat_ref.extensions.discretized_sdf.recipe import (
     reset_distances,
     reset_distances_on_white,
 )
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io.frames import place_fields
 from minisplat_ref.io.images import read_image
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, PER_SURFEL, STAGE, ReflectiveSurfels, sigmoid
+from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, PER_SURFEL, STAGE, sigmoid
 from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import Request
@@ -77,23 +79,45 @@ def test_far_and_near_distances_stay_finite(dtype):
 
 
 @pytest.mark.parametrize("stage", [PER_SURFEL, PER_PIXEL])
-def test_with_gamma_of_zero_every_surfel_is_opaque_as_ref_gaussians(stage, backend, rng):
+def test_opacities_are_those_of_the_distances(stage, backend, rng):
+    """As Ref-Gaussian's with these opacities, whose surfels have no own colours here; with gamma = 0 all are opaque."""
     g = with_distances(make_gaussians(rng, 20, size=0.3), rng, foreground=0.0)
     g = g._replace(distances=rng.normal(size=20))
     view, request = view_from(make_camera(rng=rng)), Request(np.array([0.3, 0.2, 0.1]), backend=backend)
-    plain = ReflectiveSurfels(*g[:9])
     images = []
-    for width in (1e300, 0.3):
+    for width, logits in ((1e300, np.full(20, 1e3)), (0.3, opacity_logits(g.distances, log_of(0.3)))):
         shared = shared_of(width, stage)
-        logits = opacity_logits(g.distances, log_of(width))
         found, _ = DISTANCED.renderer.render(Model(g, shared), view, request)
-        expected, _ = REFLECTIVE.render(Model(plain._replace(opacity_logits=logits), shared), view, request)
+        plain = g._replace(opacity_logits=logits)
+        expected, _ = REFLECTIVE.render(Model(plain, shared), view, request)
         assert_array_equal(found.image, expected.image)
         images.append(found.image)
-    opaque = plain._replace(opacity_logits=np.full(20, 1e3))
-    expected, _ = REFLECTIVE.render(Model(opaque, shared), view, request)
-    assert_array_equal(images[0], expected.image)
     assert np.abs(images[1] - images[0]).max() > 0.01
+
+
+def test_light_is_scattered_by_the_albedo(rng):
+    """Whatever coefficients of colours there are: they belong to other recipes."""
+    g = with_distances(make_gaussians(rng, 20, size=0.3), rng, foreground=0.0)
+    view, shared = view_from(make_camera(rng=rng)), shared_of(0.3)
+    first, second = (
+        DISTANCED.renderer.render(Model(g._replace(sh_dc=np.full((20, 3), c)), shared), view, Request())[0].image
+        for c in (0.0, 3.0)
+    )
+    assert_array_equal(first, second)
+    brighter = {**shared, ENVIRONMENT: shared[ENVIRONMENT] + np.log(2)}
+    assert DISTANCED.renderer.render(Model(g, brighter), view, Request())[0].image.mean() > 1.2 * first.mean()
+
+
+def test_the_start_is_the_released_one(rng):
+    """Distances between 0 and 2 that are even, gamma 1, roughness sigmoid(0.6), half of it metal, shading per pixel."""
+    found = with_distances(make_gaussians(rng, 400), rng, foreground=0.0)
+    assert 0 < found.distances.min() < 0.05 and 1.95 < found.distances.max() < 2
+    assert_allclose([found.distances.mean(), found.distances.std()], [1, 1 / 3**0.5], rtol=0.1)
+    assert_allclose(sigmoid(found.opacity_logits), 1 / np.cosh(found.distances / 2) ** 2, rtol=1e-9)
+    assert (found.roughness_logits == 0.6).all() and not found.metallic_logits.any()
+    shared = first_shared(None, rng)
+    assert shared[STAGE] == PER_PIXEL and shared[LOG_WIDTH] == 0
+    assert find_recipe("discretized-sdf").representation.extend.keywords == {"foreground": 0.0}
 
 
 def test_a_start_on_the_sphere(rng):
@@ -109,8 +133,8 @@ def test_a_start_on_the_sphere(rng):
     assert_allclose(np.abs(np.sum(outwards * normals, axis=1)), 1, rtol=1e-12)
     others = np.setdiff1d(np.arange(40), rows)
     assert_array_equal(found.means[others], gaussians.means[others])
-    assert_allclose(found.opacity_logits, gaussians.opacity_logits, rtol=1e-9)
-    assert (found.distances > 0).any() and (found.distances < 0).any()
+    assert_allclose(found.distances[rows], 0.2 / 1.1 * away[rows[-1]], rtol=1e-12)
+    assert np.ptp(found.distances[others]) > 0.5
     none = with_distances(gaussians, rng, foreground=0.0)
     assert_array_equal(none.means, gaussians.means)
     rows, _, _ = _foreground(gaussians.means[:7], 0.4)
@@ -132,12 +156,12 @@ def rendered_of(means, distances, depth=2.0, width=8, height=6, **changed):
 
 
 def test_the_projection_by_hand():
-    """Depths of the projected centres 2.03, 1.96 and 2.2; the last is too far, one is beside the image, one behind."""
+    """Depths of the projected centres 2.03, 1.96 and 2.2; the last, too far, counts as 0 of 3; others are unseen."""
     means = [[0, 0, 2.13], [0.1, 0, 1.9], [0, 0.1, 2.2], [9, 0, 2.0], [0, 0, -2.0]]
     value, v = recipe.projection(rendered_of(means, [0.1, -0.06, 0, 0, 0]), reach=0.1)
-    assert_allclose(value, (0.03 + 0.04) / 2, rtol=1e-9)
-    assert_allclose(v.gaussians["means"][:, 2], [0.5, -0.5, 0, 0, 0])
-    assert_allclose(v.gaussians["distances"], [-0.5, 0.5, 0, 0, 0])
+    assert_allclose(value, (0.03 + 0.04) / 3, rtol=1e-9)
+    assert_allclose(v.gaussians["means"][:, 2], [1 / 3, -1 / 3, 0, 0, 0])
+    assert_allclose(v.gaussians["distances"], [-1 / 3, 1 / 3, 0, 0, 0])
     assert not v.gaussians["quats"][2:].any()
     near = rendered_of([[0, 0, 0.009], [0, 0, 0.011]], [0.0, 0.0], depth=0.05)  # what touches the camera has no pixel
     assert_allclose(recipe.rendered_depths(near), [0, 0.05], rtol=1e-6)
@@ -161,9 +185,12 @@ def test_the_median_by_hand():
         np.zeros((3, 3)), s, model=Model(rendered_of(np.zeros((3, 3)), s).model.gaussians, shared_of(0.1))
     )
     assert recipe.median(sharp)[0] == 0
-    assert recipe.median(rendered_of(np.zeros((3, 3)), [0.0, 0.0, 0.0]))[0] == 0
+    for small in ([0.0, 0.0, 0.0], [0.1, -0.1, 0.3]):  # up to 0.1 nothing more is wanted than this
+        assert reference_sharpness(np.array(small)) == 4.549
+    assert_allclose(reference_sharpness(np.array([0.1000001])), 17.62747, rtol=1e-5)
+    assert_allclose(recipe.median(rendered_of(np.zeros((3, 3)), [0.0, 0.0, 0.0]))[0], 2.549, rtol=1e-12)
     [term] = [term for term in RECIPE.losses if term.name == "median"]
-    assert not term.is_due(1_000) and term.is_due(1_001) and term.weight == 100
+    assert not term.is_due(1_000) and term.is_due(1_001) and term.weight == 1
 
 
 def test_the_silhouette_by_hand():
@@ -182,9 +209,55 @@ def test_the_silhouette_by_hand():
     assert v.alpha[0, 0] == 0 and v.alpha[0, 7] > 0
 
 
+def test_smooth_maps_by_hand():
+    """A step of 0.3 in the metallic share has the slope 1.2 in two columns, of which the mask leaves 4 rows."""
+    rendered = rendered_of(np.zeros((1, 3)), [0.0])
+    image = np.zeros((6, 8, 5))
+    image[:, 4:, 3] = 0.3
+    slices = {"albedo": slice(0, 3), "metallic": slice(3, 4), "roughness": slice(4, 5)}
+    mask = np.zeros((6, 8), bool)
+    mask[1:5, 1:7] = True
+    shown = rendered._replace(
+        output=rendered.output._replace(image=image), channels=slices, view=rendered.view._replace(mask=mask)
+    )
+    value, v = recipe.base_smoothness(shown)
+    assert_allclose(value, 4 * 2 * 4 * 0.3 / 48, rtol=1e-12)
+    assert_allclose(v.channels["metallic"][2, :, 0] * 48, [0, 0, -4, -4, 4, 4, 0, 0], atol=1e-12)
+    coloured = np.zeros((6, 8, 5))
+    coloured[:, 4:, 0] = 0.3
+    value, v = recipe.base_smoothness(shown._replace(output=rendered.output._replace(image=coloured)))
+    assert_allclose(value, 4 * 2 * 4 * 0.1 / 48, rtol=1e-12)  # of the mean of three channels
+    assert_allclose(v.channels["albedo"][2, 4] * 48, 4 / 3)
+    whole, _ = recipe.base_smoothness(shown._replace(view=rendered.view))
+    assert whole > 5 * value
+
+
+def test_the_derivative_of_smooth_maps(rng):
+    rendered = rendered_of(np.zeros((1, 3)), [0.0])
+    image, direction, h = rng.normal(size=(6, 8, 5)), rng.normal(size=(6, 8, 5)), 1e-7
+    slices = {"albedo": slice(0, 3), "metallic": slice(3, 4), "roughness": slice(4, 5)}
+
+    def at(x):
+        return recipe.base_smoothness(rendered._replace(output=rendered.output._replace(image=x), channels=slices))
+
+    v = np.concatenate([at(image)[1].channels[name] for name in slices], axis=2)
+    numeric = (at(image + h * direction)[0] - at(image - h * direction)[0]) / (2 * h)
+    assert_allclose(np.sum(v * direction), numeric, rtol=1e-6)
+
+
+def test_neutral_light_by_hand():
+    """One texel of two is (3, 1, 2): 1 + 1 + 0 off its mean, of six values; grey ones do not count."""
+    light = np.log(np.array([[[3.0, 1.0, 2.0], [5.0, 5.0, 5.0]]]))
+    rendered = rendered_of(np.zeros((1, 3)), [0.0])
+    model = rendered.model._replace(shared={**rendered.model.shared, ENVIRONMENT: light})
+    value, v = recipe.neutral_light(rendered._replace(model=model))
+    assert_allclose(value, 2 / 6, rtol=1e-12)
+    assert_allclose(v.shared[ENVIRONMENT][0, 0], [3 / 6, -1 / 6, 0], atol=1e-12)
+
+
 def test_density_control_by_distance(rng):
     g = with_distances(make_gaussians(rng, 6), rng, foreground=0.0)
-    g = g._replace(distances=np.array([0.0, 0.01, -0.02, 0.3, -0.4, 0.1]))
+    g = g._replace(distances=np.array([0.0, 0.2, -0.4, 6.0, -8.0, 2.0]))
     moments = SimpleNamespace(distances=np.ones(6))
     state = SimpleNamespace(gaussians=g, shared=shared_of(WIDTH), adam=SimpleNamespace(first=moments, second=moments))
     refresh_opacities(state, None)

@@ -8,13 +8,17 @@ signed distance of mu from the surface. With one gamma > 0 for all, which is tra
 
 so 1 on the surface, and one half at |s| = ln(3 + 2 sqrt 2) / gamma. The point x_0 = mu - s n should be on the surface:
 
-    projection   |z(x_0) - D| of the rendered depth D at its pixel, where that is below 0.1; D is held constant
-    median       100 max(0, gamma_ref - gamma) from iteration 1,000: the opacity of median |s| is at most one half
-    further      normal_consistency 0.2, distortion 100, silhouette 0.001 (cross entropy of alpha and the mask)
+    projection   5 |z(x_0) - D| of the rendered depth D at its pixel, where that is below 0.1; D is held constant
+    median       max(0, gamma_ref - gamma): the opacity of median |s| is at most one half, unless that is below 0.1
+    distortion   100, as these two from iteration 1,000
+    further      normal_consistency 0.2, silhouette 0.2 (cross entropy of alpha and the mask),
+                 base_smoothness 0.02 (slopes of the maps of materials), neutral_light 0.001 (grey environments)
 
-Training begins with the foreground on a sphere; its stages of shading are those of ``reflective``.
+Pixels are shaded from the start, without occlusion and light from around; what a surface scatters is its albedo in the
+environment's light, so that all of it can be lit anew. The background is random.
 
-    minisplat-ref train SCENE --recipe discretized-sdf --set foreground=1 --out runs/sdf
+    minisplat-ref train SCENE --recipe discretized-sdf --out runs/sdf
+    minisplat-ref train OBJECT --recipe discretized-sdf --set foreground=1 --out runs/sdf
     minisplat-ref render runs/sdf --map normal
     minisplat-ref render runs/sdf --environment studio.png
     python -m data_tools.claims discretized-sdf/sphere --out DIR
@@ -27,11 +31,14 @@ The PLY has the distances, and as ``opacity`` the opacities that follow from the
 ``shared.npz`` beside it, as ln(1 / gamma), the environment likewise. Clones and children of a split inherit s, which a
 tangent plane does not change; faint surfels are pruned by their opacity, and a reset of opacities raises |s|.
 
-This deviates from the paper as follows. The foreground is the half of the points that is nearest to their median, and
-its radius, the weight of the projection, the first gamma and all rates are ours. The inverse of D is interpolated.
-Dates of normals and distortion are those of 2D Gaussian Splatting. A mask of the scene is taken for the object's: where
-it hides something else, train with ``--set silhouette=0``. With another recipe, density control sees the first
-opacities.
+Dates, rates and the start are those of the released code, weights those of its script for shiny objects. Lengths are in
+world units, and meant for an object of about one. This deviates from the code as follows. The distortion has the
+default of the code, 100, where its scripts have 2,000 for objects before nothing; in a room even 100 costs much
+(``docs/FAMILY.md``). Its sphere, which is an option there, too, is around the points and in their size, instead of the
+origin; ``foreground`` is the share of the points that it takes the place of. gamma is trained as its logarithm. A reset
+raises |s| on both sides of the surface, there on one. Surfels face at random, and the albedo begins with their colours.
+The inverse of D is interpolated. A mask of the scene is taken for the object's: where it hides something else, train
+with ``--set silhouette=0``. With another recipe, density control sees the first opacities.
 """
 
 from minisplat_ref.extensions.discretized_sdf.model import DISTANCED, stages

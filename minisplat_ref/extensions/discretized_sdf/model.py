@@ -15,20 +15,23 @@ from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.editing.deformation import quaternions
 from minisplat_ref.mechanisms.gbuffer import renderer as shaded
 from minisplat_ref.mechanisms.gbuffer.gradient_checks import shading_stage
-from minisplat_ref.mechanisms.gbuffer.population import WITH_OCCLUSION, first_light, with_materials
-from minisplat_ref.mechanisms.gbuffer.training import SHADING_RATES
+from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, STAGE, first_light, with_materials
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.rendering import Renderer, RenderGradient, Request
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, Scene, View
 
 LOG_WIDTH = "log_width"  # name of the shared parameter, ln(1 / gamma)
-WIDTH = 0.05  # 1 / gamma at the start, world units
+WIDTH = 1.0  # 1 / gamma at the start, world units, as released
+START_MAX, START_ON_SPHERE = 2.0, 0.2 / 1.1  # of first distances: world units; in radii of the sphere
+ROUGHNESS_LOGIT = 0.6  # at the start; that of the metallic share is 0
+NEAR, SHARPNESS_NEAR = 0.1, 4.549  # up to this median of |s|, world units, this gamma is wanted
 X_MIN = 1e-30  # of |x|: at a distance of 0 the logit has no value; there the opacity is 1 long before
 HALF = np.log(3 + 2 * np.sqrt(2))  # 1.7627: gamma |s| at which the opacity is one half
 
@@ -73,9 +76,12 @@ def _x(distances: Floats, log_width: Floats) -> Floats:
 
 
 def reference_sharpness(distances: Floats) -> float:
-    """Return the gamma at which the opacity of the median of ``|s|`` is one half; infinite if that is 0."""
+    """Return the gamma at which the opacity of the median of ``|s|`` is one half.
+
+    Where that median is at most 0.1, gamma is 4.549, as released: surfels near the surface do not fade.
+    """
     median = float(np.median(np.abs(distances))) if len(distances) else 0.0
-    return HALF / median if median > 0 else np.inf
+    return HALF / median if median > NEAR else SHARPNESS_NEAR
 
 
 def projected(means: Floats, quats: Floats, distances: Floats) -> Floats:
@@ -96,8 +102,22 @@ def projected_vjp(quats: Floats, distances: Floats, v_points: Floats) -> tuple[F
     return v_points, rotation_matrices_vjp(quats, v_R), -np.sum(R[:, :, 2] * v_points, axis=1)
 
 
+def tint(log_environment: Floats) -> float:
+    """Return how far light is from grey, ``mean |E - (E_r + E_g + E_b) / 3|`` over an environment [H, W, 3]."""
+    E = np.exp(log_environment)
+    return float(np.mean(np.abs(E - E.mean(axis=2, keepdims=True)), dtype=np.float64))
+
+
+def tint_vjp(log_environment: Floats) -> Floats:
+    """Derivative of :func:`tint`: with ``s = sign(E - mean E)``, ``E (s - mean s) / values``."""
+    E = np.exp(log_environment)
+    s = np.sign(E - E.mean(axis=2, keepdims=True))
+    v: Floats = E * (s - s.mean(axis=2, keepdims=True)) / E.dtype.type(E.size)
+    return v
+
+
 class SDFSurfels(NamedTuple):
-    """Surfels with a material and a signed distance: the fields of ``ReflectiveSurfels``, and one more."""
+    """Surfels with a material and a signed distance; the light that they scatter is that of the environment."""
 
     means: Floats
     quats: Floats
@@ -114,41 +134,41 @@ class SDFSurfels(NamedTuple):
 
 
 def with_distances(gaussians: Gaussians, rng: np.random.Generator, *, foreground: float) -> SDFSurfels:
-    """Return surfels at distances that give them the opacities of the Gaussians; the foreground begins as a sphere.
+    """Return surfels at random distances between 0 and 2 world units; a foreground begins as a sphere.
 
-    Half of the surfels, at random, have negative distances. Those of the foreground are moved along the radius, and
-    face outwards, so that each is projected onto the sphere.
+    Surfels of the foreground are moved along the radius, and face outwards, so that each is projected onto the sphere;
+    all of them have the same distance.
 
     Parameters
     ----------
     gaussians : Gaussians
         At the start.
     rng : numpy.random.Generator
-        For directions and signs.
+        For directions and distances.
     foreground : float
         Share of the Gaussians that are in the foreground, those nearest to the median of all centres. The sphere
         around it has their largest distance as its radius; 0 leaves all centres where they are.
     """
     surfels = with_materials(gaussians, rng)
     n, dtype = len(surfels.means), surfels.means.dtype
-    size = 2 * WIDTH * np.arcsinh(np.exp(-surfels.opacity_logits.astype(np.float64) / 2))
-    distances = size * rng.choice([-1.0, 1.0], size=n)
+    distances = rng.uniform(0, START_MAX, size=n)
     means, quats = surfels.means.astype(np.float64), surfels.quats.copy()
     rows, center, radius = _foreground(means, foreground)
     if len(rows):
         outwards = means[rows] - center
         length = np.linalg.norm(outwards, axis=1, keepdims=True)
         normals = np.where(length > 0, outwards / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+        distances[rows] = START_ON_SPHERE * radius
         means[rows] = center + (radius + distances[rows, None]) * normals
         quats[rows] = facing(normals, rotation_matrices(surfels.quats[rows].astype(np.float64)))
     distances = distances.astype(dtype)
-    return SDFSurfels(
-        **surfels._replace(
-            means=means.astype(dtype),
-            quats=quats,
-            opacity_logits=opacity_logits(distances, np.full(1, np.log(WIDTH), dtype)),
-        )._asdict(),
-        distances=distances,
+    own = {name: field for name, field in surfels._asdict().items() if name in SDFSurfels._fields}
+    return SDFSurfels(**own, distances=distances)._replace(
+        means=means.astype(dtype),
+        quats=quats,
+        opacity_logits=opacity_logits(distances, np.full(1, np.log(WIDTH), dtype)),
+        metallic_logits=np.zeros(n, dtype),
+        roughness_logits=np.full(n, ROUGHNESS_LOGIT, dtype),
     )
 
 
@@ -174,8 +194,9 @@ def facing(normals: Floats, near: Floats) -> Floats:
 
 
 def first_shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
-    """Return the shared parameters at the start: an environment of 1, shading per surfel, and gamma."""
-    return {**first_light(scene, rng), LOG_WIDTH: np.full(1, np.log(WIDTH), np.float32)}
+    """Return the shared parameters at the start: an environment of 1, shading per pixel, and gamma."""
+    start = {STAGE: np.full(1, PER_PIXEL, np.float32), LOG_WIDTH: np.full(1, np.log(WIDTH), np.float32)}
+    return {**first_light(scene, rng), **start}
 
 
 class _SDFTape(NamedTuple):
@@ -214,11 +235,23 @@ def render_distanced_vjp(tape: _SDFTape, v_image: Floats, v_alpha: Floats | None
     return v._replace(gaussians=gaussians, shared=shared)
 
 
-RATES = SHADING_RATES.join(Rates({"distances": 0.025 * WIDTH, LOG_WIDTH: 1e-3, "opacity_logits": 0.0}, frozenset()))
+NO_COLORS = {"sh_dc": 0.0, "sh_rest": 0.0}  # what surfels show comes from their material alone
+_SHADING_RATE = LogLinear(1.6e-2, 1.6e-3, 30_000)
+RATES = Rates(
+    {
+        "distances": 0.05,
+        LOG_WIDTH: 5e-3,
+        "opacity_logits": 0.0,
+        STAGE: 0.0,
+        **NO_COLORS,
+        **dict.fromkeys(("albedo_logits", "metallic_logits", "roughness_logits", ENVIRONMENT), _SHADING_RATE),
+    },
+    frozenset(),
+)
 DISTANCED = Representation(
     "surfels with distances",
     population=SDFSurfels,
-    extend=partial(with_distances, foreground=0.5),
+    extend=partial(with_distances, foreground=0.0),
     shared=first_shared,
     renderer=Renderer(
         "surfels with distances", partial(render_distanced, mirrors=True), render_distanced_vjp, shaded.channels
@@ -235,7 +268,7 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
         setting,
         rng,
         DISTANCED,
-        WITH_OCCLUSION,
+        PER_PIXEL,
         render=partial(render_distanced, mirrors=True),
         shaded=lambda tape: tape.shaded,
     )
@@ -255,4 +288,12 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
         lambda m, q, s: Point((projected(m, q, s),)),
         lambda v: projected_vjp(g.quats, own, v),
     )
-    return whole, transform, projection
+    light = rng.normal(size=(4, 8, 3))
+    neutral = Stage(
+        "loss term neutral_light",
+        {ENVIRONMENT: light},
+        ("value",),
+        lambda x: Point((np.array([tint(x)]),)),
+        lambda v: (v[0] * tint_vjp(light),),
+    )
+    return whole, transform, projection, neutral
