@@ -13,10 +13,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite import cameras
 from minisplat_ref.extensions.satellite import model as formulas
-from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.model import HAS_SHADOWS, IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.extensions.satellite.recipe import (
     SEEN_FROM_ABOVE,
     begin_transparent,
+    cast_shadows,
     fold_reference,
     hold_sky,
     opacity_sparsity,
@@ -30,6 +31,7 @@ from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.losses import Rendered
+from minisplat_ref.training.schedule import firing_steps
 from minisplat_ref.types import Camera, Model, Optics, view_from
 from scenes import as_dtype
 from tolerances import PARITY_FLOAT64
@@ -419,10 +421,11 @@ def test_loss_terms_by_hand(setting):
         Request(),
     )
     assert opacity_sparsity(rendered)[0] == pytest.approx((0.5 + 0.75) / 8)
-    entropy = np.log(2) + 0.25 * np.log(4) + 0.75 * np.log(4 / 3)
+    bits = 1 + 0.25 * np.log2(4) + 0.75 * np.log2(4 / 3) - 2 * np.log2(0.95)  # what is surely lit or dark has little
     value, v = shadow_entropy(rendered)
-    assert value == pytest.approx(entropy / 4)
-    assert v.channels["shadow"].ravel().tolist() == pytest.approx([0.0, 0.0, np.log(3) / 4, 0.0])
+    assert value == pytest.approx(bits / 4)
+    slopes = [0.0, -np.log2(19) / 4, np.log2(3) / 4, np.log2(19) / 4]
+    assert v.channels["shadow"].ravel().tolist() == pytest.approx(slopes)
 
 
 def test_other_cameras_are_refused(setting):
@@ -431,6 +434,28 @@ def test_other_cameras_are_refused(setting):
         SATELLITE.render(Model(setting.gaussians), view_from(bent), Request())
     with pytest.raises(InputError, match="does not give surface"):
         SATELLITE.render(Model(setting.gaussians), view_from(setting.camera), Request(wants=frozenset({"surface"})))
+
+
+def test_shadows_begin_at_their_date():
+    """Before, a photograph has its albedo; from iteration 1,000 of 5,000 on it is shaded, and two losses count."""
+    recipe, truth = find_recipe("satellite"), boxes.make_scene(0, n_points=200, size=12)
+    state = initial_state(truth.scene, recipe, 0)
+    state.gaussians = state.gaussians._replace(opacity_logits=np.full_like(state.gaussians.opacity_logits, 3.0))
+    request, view = Request(wants=frozenset({"shadow", "albedo"})), truth.scene.train_views[0]
+
+    def shadow_of():
+        output, tape = SATELLITE.render(state.model, view, request)
+        v = SATELLITE.render_vjp(tape, np.ones_like(output.image))
+        assert v.shared[HAS_SHADOWS] == 0
+        return output.image[..., SATELLITE.channels(request.wants)["shadow"]]
+
+    assert (shadow_of() == 1).all()
+    cast_shadows(state, None)
+    assert shadow_of().min() < 0.9
+    assert firing_steps(recipe, cast_shadows) == [1_000]
+    for name in ("view_consistency", "shadow_entropy"):
+        [term] = [term for term in recipe.losses if term.name == name]
+        assert not term.is_due(1_000) and term.is_due(1_001)
 
 
 def test_light_in_shadows_stays_between_none_and_the_sun_s():

@@ -13,11 +13,11 @@ from data_tools.claims.satellite.boxes import HIGH, SCALE, SIZE, Truth, make_sce
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite.cameras import fit_residual
 from minisplat_ref.extensions.satellite.commands import surface_model
-from minisplat_ref.extensions.satellite.model import IN_SHADOW, RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.model import RADIOMETRY, SATELLITE
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.rates import LogLinear, Rates
+from minisplat_ref.training.rates import LogLinear
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Floats, Model, Scene
 
@@ -63,7 +63,7 @@ def arm_of(arm: str, recipe: Recipe, scene: Scene) -> tuple[Recipe, Scene]:
                  for v in scene.train_views]  # fmt: skip
         return recipe, scene._replace(train_views=tuple(views))
     if arm == "without radiometry":
-        still = recipe.representation._replace(rates=Rates({RADIOMETRY: 0.0, IN_SHADOW: 0.01}, frozenset()))
+        still = recipe.representation._replace(rates=recipe.representation.rates.change(radiometry=0.0))
         return recipe._replace(representation=still), scene
     if arm == "an opaque start":
         return recipe._replace(events=recipe.events[1:]), scene

@@ -30,6 +30,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, RenderOutput
 DARKENING = 0.4  # per unit of altitude, a metre
 MIN_ALPHA = 0.05  # fainter pixels have no altitude; they count as if they were as opaque
 RADIOMETRY, IN_SHADOW = "radiometry", "in_shadow"  # shared: [V, 3, 4] and [V, 3]
+HAS_SHADOWS = "has_shadows"  # shared: [1], 0 in the first part of a training; a model without it has shadows
 REFERENCE_VIEW = 0  # whose radiometry views have that are not trained on
 CHANNELS = {"depth": 1, "albedo": 3, "altitude": 1, "shadow": 1}  # besides rgb, in this order
 WANTS = frozenset({*CHANNELS, "stats", "median_depth"})
@@ -324,7 +325,7 @@ def render_photograph(model: Model, view: View, request: Request) -> tuple[Rende
     h = altitudes(sums, alpha)
     shift, of_sun, shadow = sun_shift(view.camera), None, None
     s = np.ones_like(alpha)
-    if shift != (0.0, 0.0):
+    if shift != (0.0, 0.0) and model.shared.get(HAS_SHADOWS, (1.0,))[0] > 0:
         margin = camera.width // 2, camera.height // 2
         of_sun = splat_view(model, sheared(camera, shift, margin), request, has_color=False)
         shadow = shadows(h, altitudes(*depth_sums(of_sun)), shift, margin)
@@ -383,6 +384,8 @@ def render_photograph_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = 
     if tape.is_counted:
         shared = {name: np.zeros_like(tape.model.shared[name]) for name in (RADIOMETRY, IN_SHADOW)}
         shared[RADIOMETRY][tape.row], shared[IN_SHADOW][tape.row] = of_light.radiometry, of_light.in_shadow
+    if HAS_SHADOWS in tape.model.shared:
+        shared[HAS_SHADOWS] = np.zeros_like(tape.model.shared[HAS_SHADOWS])
     return RenderGradient(
         gaussians, of_splats.background, v_A.astype(alpha.dtype), v_b.astype(alpha.dtype), of_splats.means2d, shared
     )

@@ -12,6 +12,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.satellite.cameras import AFFINE
 from minisplat_ref.extensions.satellite.model import (
     CHANNELS,
+    HAS_SHADOWS,
     IN_SHADOW,
     MIN_ALPHA,
     RADIOMETRY,
@@ -40,7 +41,8 @@ from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Camera, Floats, Gaussians, Optics, Scene
 
-FLOOR = 1e-6  # of a shadow and of its complement in the entropy, whose slope at 0 has no bound
+FLOOR = 0.05  # of a shadow and of its complement inside the logarithms of the entropy, as released
+SHADOWS_FROM = 1_000  # of 5,000 iterations; views are compared from then on, too
 ITERATIONS = 5_000
 START_OPACITY, START_SIZE = 0.005, 0.5  # of points in the volume; size relative to the distance of neighbours
 SKY_LIGHT = 0.05  # k at the start
@@ -61,26 +63,27 @@ def opacity_sparsity(rendered: Rendered) -> tuple[float, Cotangents]:
 
 
 def shadow_entropy(rendered: Rendered) -> tuple[float, Cotangents]:
-    """Return the mean of ``-s ln s - (1 - s) ln(1 - s)``; its slope is ``ln((1 - s) / s)``, 0 where s is 0 or 1."""
+    """Return the mean of ``-s log2 t - (1 - s) log2(1 - t)``, bits, with t = s kept between 0.05 and 0.95.
+
+    Its slope is ``log2((1 - t) / t)``.
+    """
     s = rendered.channel("shadow")
-    inside = (s > FLOOR) & (s < 1 - FLOOR)
-    kept = np.where(inside, s, s.dtype.type(0.5))
-    entropy = -kept * np.log(kept) - (1 - kept) * np.log(1 - kept)
-    slope = np.where(inside, np.log((1 - kept) / kept), 0).astype(s.dtype) / s.dtype.type(s.size)
-    return float(np.sum(np.where(inside, entropy, 0)) / s.size), Cotangents({"shadow": slope})
+    t = np.clip(s, FLOOR, 1 - FLOOR)
+    entropy = -s * np.log2(t) - (1 - s) * np.log2(1 - t)
+    slope = np.log2((1 - t) / t) / s.dtype.type(s.size)
+    return float(np.mean(entropy, dtype=np.float64)), Cotangents({"shadow": slope})
 
 
 def make_shear(rendered: Rendered, noise: float) -> tuple[float, float]:
-    """Return a random shear of the view in pixels per unit of altitude, the same whenever the iteration is done.
+    """Return a random shear of the view in pixels per metre of altitude, the same whenever the iteration is done.
 
-    ``M' = I + noise`` of the paper is in coordinates of -1 to 1; there the altitudes of the Gaussians span 2.
+    ``M' = I + noise`` of the paper is in coordinates of -1 to 1 across the image, and in metres along the altitude; no
+    draw is above one standard deviation.
     """
     camera = choose_affine(rendered.view.camera, rendered.request.conventions)
-    held = rendered.constant.model.gaussians.means
-    z = held @ np.asarray(camera.cam_from_world_R, np.float64)[2]
-    half = max(float(np.ptp(z)) / 2, 1e-9) if len(z) else 1.0
-    x, y = np.random.default_rng([rendered.step, max(rendered.view.view_id, 0)]).normal(size=2)
-    return noise * x * camera.width / 2 / half, noise * y * camera.height / 2 / half
+    drawn = np.random.default_rng([rendered.step, max(rendered.view.view_id, 0)]).normal(size=2)
+    x, y = noise * np.clip(drawn, -1, 1)
+    return float(x * camera.width / 2), float(y * camera.height / 2)
 
 
 def view_consistency(
@@ -90,7 +93,7 @@ def view_consistency(
 
     A pixel p of altitude h is seen at ``p' = p - g h``. Where ``|h - h'(p')| < limit``, else something hides it::
 
-        L = mean(w_h |h - h'(p')| + w_a mean_c |a - a'(p')|)
+        L = mean(w_h |h - h'(p')| + w_a sum_c |a - a'(p')|)      over the pixels that count; 0 if none does
 
     Derivatives go to the view's channels and, by the second rendering, to the population; a' and h' are read between
     pixels, so p' depends on h.
@@ -102,7 +105,7 @@ def view_consistency(
     altitude, color : float
         w_h, per unit of altitude, and w_a.
     noise : float
-        Standard deviation of the shear; see :func:`make_shear`.
+        Standard deviation of the shear, per metre; see :func:`make_shear`.
     limit : float
         Units of altitude.
     """
@@ -117,7 +120,7 @@ def view_consistency(
     read = sample(other, x, y)
     differences = np.concatenate([a, h[..., None]], axis=2) - read.values  # [H, W, 4]
     is_seen = (np.abs(differences[..., 3]) < limit) & (x > 0) & (x < width) & (y > 0) & (y < height)
-    weights = np.array([color / 3] * 3 + [altitude]) / h.size
+    weights = np.array([color] * 3 + [altitude]) / max(int(is_seen.sum()), 1)
     v = (np.sign(differences) * weights * is_seen[..., None]).astype(h.dtype)  # [H, W, 4]
     v_other, v_places = sample_vjp(read, other.shape, -v)
     v_h = v[..., 3] - shift[0] * v_places[0] - shift[1] * v_places[1]
@@ -130,7 +133,7 @@ def view_consistency(
 
 
 SPARSITY = LossTerm("opacity_sparsity", opacity_sparsity, weight=0.1)
-ENTROPY = LossTerm("shadow_entropy", shadow_entropy, weight=0.01, wants=frozenset({"shadow"}))
+ENTROPY = LossTerm("shadow_entropy", shadow_entropy, 0.01, frozenset({"shadow"}), start=SHADOWS_FROM)
 
 
 def without_directions(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
@@ -139,9 +142,18 @@ def without_directions(gaussians: Gaussians, rng: np.random.Generator) -> Gaussi
 
 
 def first_light(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
-    """Return identity radiometry [V, 3, 4] and the light of the sky [V, 3] in each photograph's shadows."""
+    """Return identity radiometry [V, 3, 4], the light of the sky [V, 3] in each photograph's shadows, and none yet."""
     n, dtype = len(scene.train_views), np.float32
-    return {RADIOMETRY: np.tile(np.eye(3, 4, dtype=dtype), (n, 1, 1)), IN_SHADOW: np.full((n, 3), SKY_LIGHT, dtype)}
+    return {
+        RADIOMETRY: np.tile(np.eye(3, 4, dtype=dtype), (n, 1, 1)),
+        IN_SHADOW: np.full((n, 3), SKY_LIGHT, dtype),
+        HAS_SHADOWS: np.zeros(1, dtype),
+    }
+
+
+def cast_shadows(state: TrainState, iteration: Iteration) -> None:
+    """Let the sun's image shade the photographs from now on."""
+    state.shared[HAS_SHADOWS][:] = 1
 
 
 def begin_transparent(state: TrainState, iteration: Iteration, *, opacity: float, size: float) -> None:
@@ -187,6 +199,7 @@ CONSISTENCY = LossTerm(
     partial(view_consistency, altitude=0.01, color=0.1, noise=0.01, limit=0.3),
     weight=1.0,
     wants=frozenset({"albedo", "altitude"}),
+    start=SHADOWS_FROM,
 )
 
 SEEN_FROM_ABOVE = Representation(
@@ -194,7 +207,7 @@ SEEN_FROM_ABOVE = Representation(
     extend=without_directions,
     shared=first_light,
     renderer=SATELLITE,
-    rates=Rates({RADIOMETRY: 0.001, IN_SHADOW: 0.01}, frozenset()),
+    rates=Rates({RADIOMETRY: 0.01, IN_SHADOW: 0.01, HAS_SHADOWS: 0.0}, frozenset()),
     takes_optics=True,
 )
 
@@ -208,6 +221,7 @@ RECIPE = GS._replace(
     losses=(*GS.losses, SPARSITY, CONSISTENCY, ENTROPY),
     events=(
         At(1, partial(begin_transparent, opacity=START_OPACITY, size=START_SIZE)),
+        At(SHADOWS_FROM, cast_shadows),
         During(hold_sky),
         Every(100, partial(prune_faint, min_opacity=0.005), start=500, min_gap=20),
         At(ITERATIONS, fold_reference),
