@@ -92,12 +92,27 @@ def test_anchors_by_hand(rng):
     anchors = as_anchors(g, rng, voxel=2.0, children=4, latent=5)
     assert_allclose(anchors.means, [[-3, 0, 5], [0, 0, 0], [2, 0, 0]], atol=CLOSED_FORM)
     assert_allclose(anchors.sh_dc, [[7, 0, 0], [2, 3, 4], [0, 0, 1]], rtol=CLOSED_FORM)
-    assert_allclose(anchors.log_scales, np.log(1 / 2), rtol=CLOSED_FORM)
+    assert_allclose(anchors.log_scales, np.log(1 / 2), rtol=CLOSED_FORM)  # half a voxel: there are no three neighbours
     assert_allclose(1 / (1 + np.exp(-anchors.opacity_logits)), 0.1, rtol=CLOSED_FORM)
     assert anchors.latents.shape == (3, 5) and anchors.offsets.shape == (3, 12) and anchors.sh_rest.shape == (3, 0, 3)
     assert 0.2 < np.abs(anchors.offsets).max() <= 0.5 and anchors.n_children == 4
     with pytest.raises(InputError, match="voxel=0 is above 0"):
         as_anchors(g, rng, voxel=0.0, children=4, latent=5)
+
+
+def test_gaussians_are_spread_over_the_distance_of_anchors(rng):
+    """Corners of a square of side 2, one of them 6 above: squared distances 4, 4, 8, and with it 36 more."""
+    means = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 6]])
+    g = make_gaussians(rng, 4, sh_degree=0)._replace(means=means, log_scales=np.full((4, 3), np.log(0.5)))
+    anchors = as_anchors(g, rng, voxel=2.0, children=2, latent=2)
+    assert_array_equal(anchors.means, means[[0, 2, 1, 3]])
+    spreads = np.sqrt([(4 + 4 + 44) / 3, (4 + 8 + 40) / 3, (4 + 8 + 40) / 3, (40 + 40 + 44) / 3])
+    assert_allclose(np.exp(anchors.log_scales), spreads[:, None] / 2 * np.ones(3), rtol=CLOSED_FORM)
+
+
+def _steps_by_hand(g):
+    """Offsets are in units of twice the scales."""
+    return np.concatenate([u.reshape(-1, 3) * 2 * np.exp(s) for u, s in zip(g.offsets, g.log_scales, strict=True)])
 
 
 def test_outputs_arrive_where_they_belong(rng):
@@ -108,7 +123,7 @@ def test_outputs_arrive_where_they_belong(rng):
     for name, width in (("opacity", 2), ("shape", 14), ("color", 6)):
         tables[name] = np.stack([np.zeros(width), 0.01 * np.arange(1, 1 + width)])
     seen = decode(Model(g, table_networks(2, tables)), view_from(make_camera()), IN_NUMPY).gaussians
-    assert_allclose(seen.means, np.repeat(g.means, 2, axis=0) + g.offsets.reshape(4, 3), rtol=CLOSED_FORM)
+    assert_allclose(seen.means, np.repeat(g.means, 2, axis=0) + _steps_by_hand(g), rtol=CLOSED_FORM)
     assert_allclose(seen.opacity_logits - g.opacity_logits[[0, 0, 1, 1]], [0, 0, 0.01, 0.02], atol=CLOSED_FORM)
     of_scales = [[0.01, 0.02, 0.03], [0.08, 0.09, 0.1]]
     of_quats = [[1.04, 0.05, 0.06, 0.07], [1.11, 0.12, 0.13, 0.14]]
@@ -164,6 +179,7 @@ def test_an_unseen_photograph_has_the_mean_embedding(rng):
 
 def test_statistics_are_those_of_anchors(rng):
     g = as_anchors(make_gaussians(rng, 6, sh_degree=0), rng, voxel=1.0, children=2, latent=2)
+    g = g._replace(log_scales=g.log_scales - np.log(4))  # so small that some pixels show none
     model, view = Model(g), view_from(make_camera())
     output, tape = RENDERER.render(model, view, Request(backend=CPU, wants=frozenset({"stats"})))
     inner, _ = SPLATTING.render(Model(tape.decoded.gaussians), view, Request(backend=CPU, wants=frozenset({"stats"})))

@@ -53,7 +53,7 @@ def anchors_of(points, rng):
     n = len(points)
     centers = np.full((n, 3), FAR) + np.arange(n)[:, None]
     made = at_rest(centers, rng.normal(size=(n, 3)), rng.normal(size=(n, 4)), 1.0, 2, rng)
-    return made._replace(offsets=points - np.tile(centers, 2))
+    return made._replace(offsets=points - np.tile(centers, 2))  # spread over a voxel of side 1
 
 
 def iteration_of(scene, v_means2d):
@@ -128,14 +128,13 @@ def test_levels_by_hand(rng):
     # at the second level the place 30 / 4 = 7.5 is rounded to 8, where the first level has put an anchor
     centers = [[0, 0, 0], [32, 0, 0], [48, 0, 0], [4, 0, 0], [6, 0, 0]]
     assert_allclose(edit.gaussians.means[2:], centers, atol=CLOSED_FORM)
-    assert_allclose(np.exp(edit.gaussians.log_scales[2:, 0]) * np.sqrt(2), [16, 16, 16, 4, 1], rtol=CLOSED_FORM)
+    assert_allclose(2 * np.exp(edit.gaussians.log_scales[2:, 0]), [16, 16, 16, 4, 1], rtol=CLOSED_FORM)
     parents = [0, 0, 1, 0, 0]
     assert_array_equal(edit.parent_ids, [0, 1, *parents])
     assert_array_equal(edit.is_new, [False] * 2 + [True] * 5)
     assert_array_equal(edit.gaussians.latents[2:], anchors.latents[parents])
     assert_array_equal(edit.gaussians.sh_dc[2:], anchors.sh_dc[parents])
-    sides = np.array([16, 16, 16, 4, 1])[:, None]
-    assert (np.abs(edit.gaussians.offsets[2:]) <= sides / 2).all()
+    assert (np.abs(edit.gaussians.offsets[2:]) <= 1 / 2).all()
     assert_array_equal(edit.gaussians.offsets[:2], anchors.offsets)
 
 
@@ -144,7 +143,7 @@ def test_chance_eliminates_a_half_a_quarter_and_an_eighth(rng):
     n = 2000
     points = 64.0 * np.arange(n)[:, None] * [1, 0, 0] + [5.3, 0, 0]
     edit = grow(anchors_of(points, rng), np.full((n // 2, 2), 9.0), 1.0, 1.0, rng)
-    sides = np.round(np.exp(edit.gaussians.log_scales[n // 2 :, 0]) * np.sqrt(2))
+    sides = np.round(2 * np.exp(edit.gaussians.log_scales[n // 2 :, 0]))
     for side, share in ((16, 1 / 2), (4, 3 / 4), (1, 7 / 8)):
         assert abs(np.sum(sides == side) - share * n) < 5 * np.sqrt(n * share * (1 - share))
 
@@ -154,7 +153,8 @@ def test_the_state_grows(scene, state):
     n = len(state.gaussians.means)
     state.adam.first.latents[:] = 1.0
     side = voxel_side(initial_gaussians(scene, 0, np.random.default_rng(0)), 1.0)
-    state.gaussians.offsets[4, :3] = 1000 * side  # where there is no voxel with an anchor
+    spread = 2 * np.exp(state.gaussians.log_scales[4])
+    state.gaussians.offsets[4, :3] = 1000 * side / spread  # where there is no voxel with an anchor
     v = np.zeros((n, 4))
     for row in (4, 5):
         v[row, :2] = 1.0
@@ -164,7 +164,7 @@ def test_the_state_grows(scene, state):
     new = state.gaussians.means[n:]
     assert 1 <= len(new) <= 6 and COUNT not in state.stats and SUM not in state.stats
     assert len(state.adam.first.latents) == n + len(new) and (state.adam.first.latents[n:] == 0).all()
-    finest = new[np.exp(state.gaussians.log_scales[n:, 0]) * np.sqrt(2) < 1.01 * side]
+    finest = new[2 * np.exp(state.gaussians.log_scales[n:, 0]) < 1.01 * side]
     assert_allclose(finest / side, np.round(finest / side), atol=2e-3)  # float32 a thousand sides away
     collect_gradients_of_children(state, iteration_of(scene, np.zeros((n + len(new), 4))), growth_threshold=1e-3)
     note = grow_anchors(state, iteration_of(scene, v), voxel=1.0, growth_threshold=1e-3)

@@ -8,7 +8,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cus.gradient_checks import small
 from minisplat_ref.extensions.cus.memory import _read_map, feature_map, sample_rows
-from minisplat_ref.extensions.cus.model import ANCHORS, CAMERAS, MEMORY, UNITS, as_anchors, decode, decode_vjp
+from minisplat_ref.extensions.cus.model import ANCHORS, CAMERAS, MEMORY, as_anchors, decode, decode_vjp
 from minisplat_ref.extensions.cus.recipe import (
     blended_queries,
     feature_loss,
@@ -104,11 +104,11 @@ def test_the_recipe_by_its_numbers():
     first, last = recipe.rates.at(1, 2.0), recipe.rates.at(30_000, 2.0)
     still = ("means", "quats", "opacity_logits", "sh_dc", "sh_rest", "memory")
     assert all(first[name] == 0 for name in still)
-    assert first["latents"] == last["latents"] == 2e-2 and first["log_scales"] == 5e-3
-    assert_allclose([first["offsets"], last["offsets"]], [2 * 1.6e-4, 2 * 1.6e-6], rtol=1e-3)
-    by_name = {"color_weights_0": 8e-3, "shape_biases_1": 2e-3, "query_weights_1": 5e-3, "memory_keys": 1e-2}
+    assert first["latents"] == last["latents"] == 7.5e-3 and first["log_scales"] == 7e-3
+    assert_allclose([first["offsets"], last["offsets"]], [2 * 1e-2, 2 * 1e-4], rtol=1e-3)
+    by_name = {"color_weights_0": 8e-3, "shape_biases_1": 4e-3, "query_weights_1": 5e-3, "memory_keys": 1e-2}
     assert_allclose([first[name] for name in by_name], list(by_name.values()), rtol=1e-3)
-    assert UNITS["offsets"] == Unit.LENGTH and UNITS["means"] == Unit.PLACE
+    assert "offsets" not in ANCHORS.units and ANCHORS.units["means"] == Unit.PLACE  # they are in units of scales
 
 
 def test_what_training_begins_with(made, rng):

@@ -4,7 +4,7 @@ This follows CUS-GS, 2025, arXiv 2511.17904. 3DGS stores appearance for each Gau
 besides; here an anchor stores both for the K Gaussians of a voxel: a latent z of few numbers and their offsets.
 Networks that all anchors share make of it opacity, scales, rotation, colour and a query (:mod:`.model`):
 
-    mu_n = m + dx_n,   (o, s, q, c)_n = networks(z, d, e),   k_n = [query(z, d, e), dx_n / s] A + b
+    mu_n = m + 2 s u_n,   (o, s, q, c)_n = networks(z, d, e),   k_n = [query(z, d, e), u_n] A + b
 
 with the direction d of view and an embedding e of the photograph. Queries are blended as colours are, and a pixel reads
 its feature in a memory M of the photographs' features, each unlike the others (:mod:`.memory`):
@@ -34,10 +34,12 @@ the anchors, which other viewers show as one Gaussian each.
 
 This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical,
 without any claim about meaning. Networks add to the initial values of an anchor, such as the colour of its points;
-their last layers, but for that of the query, start at 0. Voxels are as large as the median distance of the points,
-instead of 0.01. Queries have 15 numbers instead of 160, and keys are as wide. The terms of the significance have
-different units and are divided by their means first; the gradient is Adam's running mean. Dates of pruning, weights,
-gamma and rates are ours. The features of 2,048 pixels are compared in an iteration, drawn at random.
+their last layers, but for that of the query, start at 0. One scale of an anchor serves as that of its Gaussians and,
+doubled, as the unit of their offsets, where Scaffold-GS trains two; offsets are random at first. Voxels are as large as
+the median distance of the points, instead of 0.01. Queries have 15 numbers instead of 160, and keys are as wide. The
+terms of the significance have different units and are divided by their means first; the gradient is Adam's running
+mean. Dates of pruning, weights and gamma are ours, and so are the rates of what Scaffold-GS does not have. The features
+of 2,048 pixels are compared in an iteration, drawn at random.
 
 Left out: the language model, and the pruning of anchors by opacity, which in Scaffold-GS accompanies their growing.
 """

@@ -6,11 +6,11 @@ the scale that its Gaussians begin with. It is seen from the direction d_v in th
 Networks of one hidden layer of ReLUs, which all anchors share, read ``x_v = [z_v, d_v, e_c]``; their outputs join the
 anchor's fields, before the activations of 3DGS. For each n of K::
 
-    mu_vn = m_v + dx_vn
+    mu_vn = m_v + dx_vn,   dx_vn = 2 s_v u_vn
     l_vn  = l_v + opacity(x_v)_n                     logit of the opacity
     (ln s_vn, q_vn) = (ln s_v, q_v) + shape(x_v)_n
     c_vn  = c_v + color(x_v)_n                       coefficient of degree 0
-    k_vn  = [query(x_v), dx_vn / s_v] A + b          what is blended to read the memory
+    k_vn  = [query(x_v), u_vn] A + b                 what is blended to read the memory
 
 A photograph that was not trained on has the mean of all embeddings. Networks that are missing, as beside a file alone,
 have outputs of 0.
@@ -24,15 +24,14 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cus.memory import check_depths, feature_map, first_keys, remember, sample_rows
-from minisplat_ref.io.frames import Unit
 from minisplat_ref.mechanisms.networks.directions import directions, directions_vjp
 from minisplat_ref.mechanisms.networks.mlp import Layer, Network, from_shared, make_network, network_rates, to_shared
 from minisplat_ref.mechanisms.networks.networks import Networks, networks_for
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.strategy.clone_split import logit
-from minisplat_ref.strategy.initialization import INITIAL_OPACITY
+from minisplat_ref.strategy.initialization import INITIAL_OPACITY, N_NEIGHBOURS, gaussians_from_means
 from minisplat_ref.training.rates import LogLinear, Rates
-from minisplat_ref.training.representation import WORLD_UNITS, Representation
+from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import BlendStats, Floats, Gaussians, Model, RenderOutput, Scene, View
 
 Shared = Mapping[str, Floats]
@@ -41,6 +40,9 @@ OPACITY, SHAPE, COLOR, QUERY = "opacity", "shape", "color", "query"
 NETWORKS = {OPACITY: 1, SHAPE: 7, COLOR: 3}
 """Outputs of each network for a Gaussian: a logit; three logarithms of scales and a quaternion; a colour."""
 CAMERAS, MIX, MEMORY, KEYS, ADAPTER = "camera_embeddings", "query_mix", "memory", "memory_keys", "adapter"
+SPREAD = (
+    2.0  # of the Gaussians of an anchor, in units of their scale at the start: the release's sigmoid(0) is one half
+)
 LATENT_SPREAD = 0.1  # standard deviation of first latents: equal ones would stay equal where photographs agree
 
 
@@ -59,7 +61,7 @@ class Anchors(NamedTuple):
     latents: Floats
     """[N, L] z."""
     offsets: Floats
-    """[N, 3 K] of the K Gaussians from the centre, world units."""
+    """[N, 3 K] u of the K Gaussians from the centre, in units of ``SPREAD`` times the anchor's scales."""
 
     @property
     def n_children(self) -> int:
@@ -70,8 +72,9 @@ class Anchors(NamedTuple):
 def as_anchors(gaussians: Gaussians, rng: np.random.Generator, *, voxel: float, children: int, latent: int) -> Anchors:
     """Return an anchor for each voxel that has a Gaussian, with the mean colour of these.
 
-    Voxels have the side ``l = voxel s``, where s is the median scale of the Gaussians, at the start the distance of a
-    point to its neighbours.
+    Its Gaussians are spread over the distance to the three nearest anchors, if there are three, and half as large.
+    Voxels have the side ``l = voxel s``, where s is the median scale of the given Gaussians, at the start the distance
+    of a point to its neighbours.
 
     Parameters
     ----------
@@ -98,7 +101,12 @@ def as_anchors(gaussians: Gaussians, rng: np.random.Generator, *, voxel: float, 
     colors = np.stack([np.bincount(rows, weights=channel, minlength=n) for channel in gaussians.sh_dc.T], axis=1)
     dtype = gaussians.means.dtype
     latents = (LATENT_SPREAD * rng.normal(size=(n, latent))).astype(dtype)
-    return at_rest(cells * side, (colors / counts[:, None]).astype(dtype), latents, side, children, rng)
+    sh_dc = (colors / counts[:, None]).astype(dtype)
+    anchors = at_rest(cells * side, sh_dc, latents, side, children, rng)
+    if n <= N_NEIGHBOURS:
+        return anchors
+    spreads = gaussians_from_means(anchors.means, sh_dc, 0).log_scales
+    return anchors._replace(log_scales=(spreads - np.log(SPREAD)).astype(dtype))
 
 
 def voxel_side(gaussians: Gaussians, voxel: float) -> float:
@@ -113,8 +121,8 @@ def at_rest(
 ) -> Anchors:
     """Return anchors as they begin.
 
-    The offsets are drawn evenly over the voxel, and the scale is ``side / sqrt(K)``, as K Gaussians side by side cover
-    a surface through it.
+    Gaussians are spread over the voxel, and half as large as it; the offsets are drawn evenly. The release has zeros,
+    which its networks tell apart; here last layers start at 0, so that Gaussians of one place would stay together.
 
     Parameters
     ----------
@@ -133,12 +141,12 @@ def at_rest(
     return Anchors(
         means=centers.astype(dtype),
         quats=np.tile(np.array([1.0, 0, 0, 0], dtype), (n, 1)),
-        log_scales=np.full((n, 3), np.log(side / np.sqrt(children)), dtype),
+        log_scales=np.full((n, 3), np.log(side / SPREAD), dtype),
         opacity_logits=np.full(n, logit(INITIAL_OPACITY), dtype),
         sh_dc=sh_dc,
         sh_rest=np.zeros((n, 0, 3), dtype),
         latents=latents,
-        offsets=(side * rng.uniform(-0.5, 0.5, size=(n, 3 * children))).astype(dtype),
+        offsets=rng.uniform(-0.5, 0.5, size=(n, 3 * children)).astype(dtype),
     )
 
 
@@ -267,7 +275,7 @@ def decode(model: Model, view: View, networks: Networks, *, with_queries: bool =
             found, tapes[name] = networks.forward(network, x)
             y[name] = found.reshape(n * k, width)
     gaussians = Gaussians(
-        means=np.repeat(g.means, k, axis=0) + g.offsets.reshape(n * k, 3),
+        means=np.repeat(g.means, k, axis=0) + steps(g),
         quats=np.repeat(g.quats, k, axis=0) + y[SHAPE][:, 3:],
         log_scales=np.repeat(g.log_scales, k, axis=0) + y[SHAPE][:, :3],
         opacity_logits=np.repeat(g.opacity_logits, k) + y[OPACITY][:, 0],
@@ -277,7 +285,7 @@ def decode(model: Model, view: View, networks: Networks, *, with_queries: bool =
     queries = joined = None
     if with_queries:
         of_voxels, tapes[QUERY] = networks.forward(_network(QUERY, model.shared, dtype), x)
-        joined = np.concatenate([np.repeat(of_voxels, k, axis=0), _steps(g)], axis=1)
+        joined = np.concatenate([np.repeat(of_voxels, k, axis=0), g.offsets.reshape(n * k, 3)], axis=1)
         (mix,) = _network(MIX, model.shared, dtype)
         queries = joined @ mix.weights + mix.biases
     return Decoded(gaussians, queries, model, view, networks, d, distances, tapes, joined)
@@ -288,9 +296,8 @@ def decode_vjp(decoded: Decoded, v: Gaussians, v_queries: Floats | None = None) 
 
     ::
 
-        v_m, v_ln s, v_q, v_l, v_c = sums over the K Gaussians,   v_dx = v_mu
-        v_A = joined^T v_k,  v_b = sum v_k,  v_[q, u] = v_k A^T         (u = dx / s)
-        v_dx += v_u / s,     v_ln s -= sum_n v_u u
+        v_m, v_ln s, v_q, v_l, v_c = sums over the K Gaussians,   v_u = 2 s v_mu,   v_ln s += sum_n v_mu dx
+        v_A = joined^T v_k,  v_b = sum v_k,  v_q = the first part of v_k A^T,   v_u += the rest
         v_x = sum over the networks;   its parts are v_z, v_d (to m_v and the pose) and v_e
 
     Parameters
@@ -307,7 +314,8 @@ def decode_vjp(decoded: Decoded, v: Gaussians, v_queries: Floats | None = None) 
     def sums(array: Floats) -> Floats:
         return array.reshape(n, k, *array.shape[1:]).sum(axis=1)
 
-    v_offsets, v_log_scales = v.means.reshape(n, 3 * k), sums(v.log_scales)
+    v_offsets = (v.means * spreads(g)).reshape(n, 3 * k)
+    v_log_scales = sums(v.log_scales) + sums(v.means * steps(g))
     v_y: dict[str, Floats] = {
         OPACITY: v.opacity_logits,
         SHAPE: np.concatenate([v.log_scales, v.quats], axis=1),
@@ -320,9 +328,7 @@ def decode_vjp(decoded: Decoded, v: Gaussians, v_queries: Floats | None = None) 
         v_shared |= to_shared(MIX, (Layer(decoded.joined.T @ v_queries, v_queries.sum(axis=0)),))
         v_joined = v_queries @ mix.weights.T
         v_y[QUERY] = sums(v_joined[:, :-3])
-        v_steps = v_joined[:, -3:]
-        v_offsets = v_offsets + (v_steps / np.repeat(np.exp(g.log_scales), k, axis=0)).reshape(n, 3 * k)
-        v_log_scales = v_log_scales - sums(v_steps * _steps(g))
+        v_offsets = v_offsets + v_joined[:, -3:].reshape(n, 3 * k)
     v_x = np.zeros((n, g.latents.shape[1] + 3 + _width(decoded.model)), dtype)
     for name, tape in decoded.tapes.items():
         if name in v_y:
@@ -347,11 +353,15 @@ def decode_vjp(decoded: Decoded, v: Gaussians, v_queries: Floats | None = None) 
     return DecodedGradient(anchors, v_shared, v_R, v_t)
 
 
-def _steps(g: Anchors) -> Floats:
-    """Return u [N K, 3], the offsets in units of the anchors' scales."""
-    offsets = g.offsets.reshape(-1, 3)
-    steps: Floats = offsets / np.repeat(np.exp(g.log_scales), g.n_children, axis=0)
-    return steps
+def steps(g: Anchors) -> Floats:
+    """Return dx [N K, 3], the offsets of the Gaussians from their anchors in world units."""
+    found: Floats = g.offsets.reshape(-1, 3) * spreads(g)
+    return found
+
+
+def spreads(g: Anchors) -> Floats:
+    """Return the unit of the offsets of each Gaussian, [N K, 3] world units."""
+    return np.repeat(g.log_scales.dtype.type(SPREAD) * np.exp(g.log_scales), g.n_children, axis=0)
 
 
 def _width(model: Model) -> int:
@@ -440,21 +450,19 @@ def render_anchors_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None = No
 CHILDREN, LATENT = 10, 32  # Gaussians of a voxel, and numbers of its latent
 
 FIXED = dict.fromkeys(("means", "quats", "opacity_logits", "sh_dc", "sh_rest", MEMORY), 0.0)
-_RATE = LogLinear(2e-3, 2e-5, 30_000)
 RATES: Mapping[str, Any] = {
     **FIXED,
-    "latents": 2e-2,
-    "offsets": LogLinear(1.6e-4, 1.6e-6, 30_000),
-    CAMERAS: LogLinear(1e-3, 1e-5, 30_000),
-    **{key: rate for name in (OPACITY, SHAPE) for key, rate in network_rates(name, 2, _RATE).items()},
-    **network_rates(COLOR, 2, LogLinear(8e-3, 8e-5, 30_000)),
+    "latents": 7.5e-3,
+    "offsets": LogLinear(1e-2, 1e-4, 30_000),
+    CAMERAS: LogLinear(5e-2, 5e-4, 30_000),
+    **network_rates(OPACITY, 2, LogLinear(2e-3, 2e-5, 30_000)),
+    **network_rates(SHAPE, 2, 4e-3),
+    **network_rates(COLOR, 2, LogLinear(8e-3, 5e-5, 30_000)),
     **network_rates(QUERY, 2, LogLinear(5e-3, 5e-5, 30_000)),
     **network_rates(MIX, 1, LogLinear(5e-3, 5e-5, 30_000)),
     KEYS: LogLinear(1e-2, 1e-4, 30_000),
     ADAPTER: LogLinear(1e-2, 1e-4, 30_000),
 }
-UNITS = {**WORLD_UNITS, "offsets": Unit.LENGTH}
-
 ANCHORS = Representation(
     "anchors",
     population=Anchors,
@@ -471,5 +479,4 @@ ANCHORS = Representation(
     ),
     renderer=Renderer("cus", render_anchors, render_anchors_vjp, SPLATTING.channels),
     rates=Rates(RATES, frozenset({"offsets"})),
-    units=UNITS,
 )

@@ -33,6 +33,7 @@ from minisplat_ref.extensions.cus.model import (
     at_rest,
     decode,
     decode_vjp,
+    steps,
     voxel_side,
 )
 from minisplat_ref.mechanisms.features.blending import BlendTape, blend_channels, blend_channels_vjp
@@ -266,7 +267,7 @@ def grow(anchors: Anchors, gradients: Floats, side: float, threshold: float, rng
     """
     n, k = gradients.shape
     is_seen = ~np.isnan(gradients)
-    points = (anchors.means[:, None] + anchors.offsets.reshape(n, k, 3))[is_seen]
+    points = (anchors.means[:, None] + steps(anchors).reshape(n, k, 3))[is_seen]
     owners = np.repeat(np.arange(n), k).reshape(n, k)[is_seen]
     parent_ids = np.arange(n)
     grown: Any = anchors
@@ -368,7 +369,7 @@ def prune_insignificant(state: TrainState, iteration: Iteration, *, share: float
 CUS = GS_ACCEL._replace(
     name="cus",
     learning_rates=GS_ACCEL.learning_rates.change(
-        **{name: rate for name, rate in FIXED.items() if name in Gaussians._fields}
+        log_scales=7e-3, **{name: rate for name, rate in FIXED.items() if name in Gaussians._fields}
     ),
     sh_degree=0,
     sh_milestones=(),
