@@ -98,8 +98,8 @@ PAYLOAD = Payload(
     appearance=Appearance(_bound_logits, _coefficients, _coefficients_vjp),
 )
 
-# Chosen between those of 3DGS for a colour's degree 0 and, 20 times less, for its higher degrees.
-RATES = Rates({"color_textures": 2.5e-3 / 4, "opacity_textures": 5e-2 / 4}, frozenset())
+# Released, for the fine-tuning of a finished model.
+RATES = Rates({"color_textures": 2.5e-3, "opacity_textures": 5e-3}, frozenset())
 
 TEXTURED_GAUSSIANS = Representation(
     "textured Gaussians",
