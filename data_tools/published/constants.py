@@ -21,6 +21,7 @@ from data_tools.published.repositories import (
     SURFELS_HEADER,
     TEXTURE_FORWARD,
     TEXTURE_MODEL,
+    TEXTURED,
     VDGS_ARGUMENTS,
 )
 from data_tools.published.rows import Said, Source, Table, code, has, kept, ours, paper, says
@@ -144,7 +145,7 @@ CONSTANTS: Table = {
         ),
         f"{_EXTENSIONS}satellite.recipe",
     ),
-    **_of(paper("3DGS: harmonics of degree 3, for textures as for colours", DEGREE=3), f"{_EXTENSIONS}textured.model"),
+    **_code(f"{_EXTENSIONS}textured.model", TEXTURED, DEGREE=says(3, "sh_degree")),
     **_of(ours("um, of displays of phases that can be bought", PITCH=8.0), f"{_EXTENSIONS}wave.hologram"),
     **_of(ours("nm, of laser diodes", WAVELENGTHS=(638.0, 520.0, 450.0)), f"{_EXTENSIONS}wave.hologram"),
     **_of(

@@ -92,7 +92,7 @@ GS_ACCEL = GS | {
         ),
     ),
     **kept(
-        "one Adam trains all harmonics, at the rate of 3DGS; there a second one steps every 16 iterations",
+        "the rate of 3DGS, where Taming 3DGS has twice that (both are divided by 20)",
         TAMING_ARGUMENTS,
         rate__sh_rest=says(0.000125, "shfeature_lr", numbers=(0.005,)),
     ),

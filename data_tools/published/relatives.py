@@ -397,7 +397,7 @@ TABLES: dict[str, Table] = {
     "multi-scale": {
         **GS,
         **paper(
-            "Multi-Scale 3DGS, sections 3.3 and 3.4",
+            "Multi-Scale 3DGS, released code as it was read before; no clone of it was found",
             coarse=(0.1, 15_001),
             coarse__factor=4,
             coarse__n_levels=3,
