@@ -144,9 +144,6 @@ PSNR_COST_MAX, SSIM_COST_MAX = 0.1, 0.005
 COST_RISE = 2.0
 """Assumed cost of a slice, as a multiple of the one before: each slice removes more important Gaussians. With 1,
 the last slice of the room cost 0.24 dB (L)."""
-COST_CAP = 3.0
-"""Multiple of these limits that ends the prune whatever the error is. Two views disagree by chance: without the cap
-snowmiku, thinned, ended with 638 Gaussians in place of 2,045, and 0.4 dB lower (N)."""
 N_SLICES = 8
 """Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
 eight."""

@@ -7,9 +7,10 @@ repairs what it can, and the changes are recomputed.
 
 The cost is measured, too, on the training views that are held out: before each slice their PSNR and SSIM are
 compared with the best so far. When the next slice would cost more than a tenth of a decibel, or five thousandths of
-SSIM, in all, the prune ends. The cost counts less its standard error over the views: where these disagree, the
-smaller model is as good as far as can be said, up to three times the limit. The prune also ends where no further slice is due: at the end of the cool-down
-nothing is removed, and all photographs are trained on, so that it can converge.
+SSIM, in all, the prune ends. To let the prune go on within the standard error of this cost was tried: two views agree
+or disagree by chance, and on ten photographs it removed Gaussians that held-out ones needed (N). The prune also ends
+where no further slice is due: at the end of the cool-down nothing is removed, and all photographs are trained on, so
+that it can converge.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.adaptive.exposure import begin_exposures
-from minisplat_ref.methods.adaptive.numbers import COST_CAP, COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
+from minisplat_ref.methods.adaptive.numbers import COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
 from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
@@ -77,7 +78,7 @@ def prune_in_slices(
     now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
     state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
     psnr, ssim = foresee_costs(state.pace.before_slices)
-    if psnr.is_above(max_psnr_cost) or ssim.is_above(max_ssim_cost):
+    if psnr.mean > max_psnr_cost or ssim.mean > max_ssim_cost:
         why = (
             f"with more removed, the held-out views might lose {psnr.mean:.2f} ± {psnr.standard_error:.2f} dB and"
             f" {ssim.mean:.4f} ± {ssim.standard_error:.4f} of SSIM in all; at most {max_psnr_cost:g} dB and"
@@ -119,10 +120,6 @@ class Cost(NamedTuple):
     """Over the views."""
     standard_error: float
     """Of the mean."""
-
-    def is_above(self, limit: float) -> bool:
-        """Return whether the cost is above a limit by more than its error, or above ``COST_CAP`` times the limit."""
-        return self.mean - self.standard_error > limit or self.mean > COST_CAP * limit
 
 
 def foresee_costs(before_slices: Sequence[Measurement]) -> tuple[Cost, Cost]:

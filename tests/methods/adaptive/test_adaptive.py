@@ -262,8 +262,6 @@ def test_views_that_disagree_make_the_cost_uncertain():
     slices = [Measurement(10 * k, psnrs, 10, 0, (0.5, 0.5)) for k, psnrs in enumerate([(20.0, 22.0), (19.8, 22.1)])]
     cost, _ = foresee_costs(slices)
     assert_allclose(cost, (0.15, 0.45), atol=1e-12)
-    assert not cost.is_above(0.06) and cost.is_above(0.049)  # three times the limit is 0.18 and 0.147
-    assert cost._replace(standard_error=0.04).is_above(0.1) and not cost._replace(standard_error=0.06).is_above(0.1)
 
 
 @pytest.mark.parametrize(
