@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
     """The evidence of the photographs about a calibration."""
 
     gain: float
-    """dB of the squared error, mean over the photographs; of a sky, of the sums over all of them."""
+    """dB of the squared error, mean over the photographs."""
     standard_error: float
     """dB."""
     fitted: Floats

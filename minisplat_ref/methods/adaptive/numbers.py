@@ -94,7 +94,7 @@ SKY_GAIN_MIN = 2.0
 """dB of the squared error, where a sky shows: it explains nearly all that is there. Skies explain 2.7 dB and more,
 other backgrounds 1.2 or less (H)."""
 SKY_N_ERRORS = 3.0
-"""Standard errors that the gain of a sky must exceed: all photographs see the same one."""
+"""Standard errors that the gain of a sky must exceed: nearly all photographs gain by it, because they see one sky."""
 LARGE, HUGE = 0.25, 1.0
 """Standard deviation along the longest axis, in units of the scene's extent: to question a Gaussian, and to remove
 it. The extent is the path of the cameras; no reason recorded for a quarter."""

@@ -14,15 +14,13 @@ The other half of the photographs judges, and vice versa, the two in turns along
 with the same fit to the scene as it is, with all its Gaussians: gaps that any colour would fill are no evidence of a
 sky.
 
-    gain = 10 log10 (sum |r - sum s_k b_k|^2 as it is / sum |r - sum s_k b_k|^2 without the large Gaussians)
-
-summed over the photographs: one that shows next to nothing of the sky counts for next to nothing. The standard error is
-that of the jackknife, from the gains g_-v without photograph v, of n: ``(n - 1) / n sum_v (g_-v - mean)^2``, the root.
+    gain of a photograph = 10 log10 (|r - sum s_k b_k|^2 as it is / |r - sum s_k b_k|^2 without the large Gaussians)
 
 Other pixels would drown it, because of all that the scene has not learned yet. A wall that is all of one colour is no
-sky: its photographs disagree about the direction in which its edges lie. A sky explains nearly all of its pixels; so
-the gain has to exceed 2 dB, and three standard errors, where a calibration with parameters for each photograph needs
-one.
+sky: its photographs disagree about the direction in which its edges lie. All photographs see one sky, so nearly all of
+them gain by it, and a sky explains nearly all of its pixels; so the mean gain has to exceed 2 dB, and three standard
+errors, where a calibration with parameters for each photograph needs one. To compare the sums over all photographs in
+place of the mean of their gains was tried: it finds a sky in a table top, and misses one of six in *outdoor* (N).
 
 If the sky is better, it is fitted to all pixels of all photographs, and only the largest of these Gaussians are
 removed, those that are larger than the path of the cameras itself. Others show a part of the scene besides, such as the
@@ -30,7 +28,7 @@ far ground, and training takes the sky off them.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -93,16 +91,9 @@ def cross_validate(photographs: Sequence[Behind]) -> Floats:
 def compare(as_it_is: Sequence[Behind], without_large: Sequence[Behind]) -> Evidence:
     """Return the evidence of two photographs or more for a sky instead of large Gaussians; ``fitted`` is its s_k."""
     before, after = cross_validate(as_it_is), cross_validate(without_large)
-    n = len(before)
-    without_one = _decibels(before.sum() - before, after.sum() - after)  # [V]
-    error = np.sqrt((n - 1) / n * np.sum((without_one - without_one.mean()) ** 2))
-    return Evidence(float(_decibels(before.sum(), after.sum())), float(error), fit_sky(without_large))
-
-
-def _decibels(before: Any, after: Any) -> Any:
-    """Return by how much sums of squares have fallen, dB."""
-    tiny = np.finfo(float).tiny
-    return 10.0 * np.log10(np.maximum(before, tiny) / np.maximum(after, tiny))
+    gains = [10.0 * np.log10(b / a) if a > 0 and b > 0 else 0.0 for a, b in zip(after, before, strict=True)]
+    error = np.std(gains, ddof=1) / np.sqrt(len(gains))
+    return Evidence(float(np.mean(gains)), float(error), fit_sky(without_large))
 
 
 def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:

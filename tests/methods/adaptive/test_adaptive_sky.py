@@ -102,19 +102,6 @@ def test_photographs_judge_each_other():
     assert compare(agreeing, agreeing).gain == 0.0, "gaps that the same sky fills either way are no evidence"
 
 
-def test_energies_are_summed_before_they_are_compared():
-    """Residuals of 4 and 1 become 1 and 1: 10 log10(5 / 2). Without the first photograph 0 dB, without the other 6.02.
-
-    Their deviations from the mean of 3.01 are 3.01 each: the root of 1 / 2 (3.01^2 + 3.01^2).
-    """
-    before, after = (
-        [Behind(np.zeros((16, 16)), np.zeros((16, 3)), e) for e in energies] for energies in ((4, 1), (1, 1))
-    )
-    found = compare(before, after)
-    assert found.gain == pytest.approx(10 * np.log10(2.5))
-    assert found.standard_error == pytest.approx(5 * np.log10(4))
-
-
 # The decision ---------------------------------------------------------------------------------------------------------
 
 
