@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from actions import act, scene_of, state_of
 from data_tools.claims.fans.profile import fan_profile
 from data_tools.claims.fans.shape_search import alpha_of, best_shape, render_clipped
-from gltf import glb_parts, only_primitive, values
+from data_tools.foreign_files.gltf import glb_parts, only_primitive, values
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gltf import glb_parts, only_primitive, values
+from data_tools.foreign_files.gltf import glb_parts, only_primitive, values
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.fusion import kernels, reference, volume
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest
@@ -253,7 +253,7 @@ def read_glb(mesh):
     document, body = glb_parts(to_glb(mesh.vertices, mesh.colors, mesh.faces))
     primitive, _ = only_primitive(document)
     names = primitive["attributes"]
-    assert set(names) == {"POSITION", "COLOR_0"} and primitive.get("mode", 4) == 4  # triangles
+    assert set(names) == {"POSITION", "NORMAL", "COLOR_0"} and primitive.get("mode", 4) == 4  # triangles
     positions, colors = (values(document, body, names[name]) for name in ("POSITION", "COLOR_0"))
     return document, positions, colors, values(document, body, primitive["indices"]).reshape(-1, 3)
 
@@ -294,6 +294,20 @@ def test_the_axes_of_gltf():
     p0, p1, p2 = np.moveaxis(positions[faces].astype(float), 1, 0)
     assert np.sum(np.cross(p0, p1) * p2) / 6 == pytest.approx(1 / 6)
     assert not {"matrix", "rotation", "scale", "translation"} & set(document["nodes"][0])
+
+
+def test_normals_of_gltf_point_outward_by_hand():
+    """At the corner of three right angles they add up to -(1, 1, 1), at (1, 0, 0) to (1, 1, 1) - (0, 1, 0) - (0, 0, 1);
+    x and y then change sign. A vertex without triangles has one, too."""
+    loose = TETRAHEDRON._replace(
+        vertices=np.concatenate([TETRAHEDRON.vertices, [[9.0, 9, 9]]]), colors=np.ones((5, 3), float)
+    )
+    document, body = glb_parts(to_glb(loose.vertices, loose.colors, loose.faces))
+    primitive, _ = only_primitive(document)
+    normals = values(document, body, primitive["attributes"]["NORMAL"])
+    third = 1 / np.sqrt(3)
+    expected = [[third, third, -third], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, 1]]
+    assert_allclose(normals, expected, atol=ROUNDED_TO_FLOAT32)
 
 
 def test_gltf_of_no_triangles_is_a_file():

@@ -98,6 +98,7 @@ def to_glb(vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> by
       levels of sRGB and make the darkest seven black. Opacity is not encoded in sRGB and stays as it is.
     - The material is unlit (KHR_materials_unlit), because the colours contain the light of the photographs. A program
       without this extension lights a matt surface; glTF's default material is a metal, which mirrors its surroundings.
+    - ``NORMAL`` is the mean of the triangles around a vertex, weighed by their areas, for those programs.
     - Triangles are visible from the front only, unless ``doubleSided`` is set. No camera has seen the back of
       a fused surface, and from outside a room one looks through its walls.
 
@@ -131,5 +132,31 @@ def to_glb(vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> by
 
     turned = vertices * GLTF_AXES  # a rotation: the order of a triangle's corners stays
     solid = trimesh_package().Trimesh(turned, faces, vertex_attributes={_COLOR: linear}, process=False)
-    content: bytes = solid.export(file_type="glb", tree_postprocessor=add_material)
+    if len(turned):
+        solid.vertex_normals = vertex_normals(turned, faces)
+    content: bytes = solid.export(file_type="glb", include_normals=len(turned) > 0, tree_postprocessor=add_material)
     return content
+
+
+def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
+    """Return the unit normal of each vertex, the mean of its triangles weighed by their areas.
+
+    Parameters
+    ----------
+    vertices : ndarray of shape (P, 3)
+    faces : ndarray of shape (T, 3)
+        Rows of the vertices, counter-clockwise seen from where the normals point.
+
+    Returns
+    -------
+    ndarray of shape (P, 3)
+        Along z where triangles are degenerate, cancel or are absent: a file may not hold a normal of no direction.
+    """
+    p0, p1, p2 = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)  # [T, 3] each
+    areas = np.cross(p1 - p0, p2 - p0)  # [T, 3], twice as long as the area
+    sums = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(along, 3), len(vertices)) for along in areas.T], axis=1
+    )  # [P, 3]
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    is_known = lengths > 0
+    return np.where(is_known, sums / np.where(is_known, lengths, 1.0), [0.0, 0.0, 1.0])
