@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from data_tools.foreign_files import dialects, leftovers, masks, meshes, names, places, ranges, terminals
+from data_tools.foreign_files import dialects, leftovers, masks, meshes, names, places, ranges, spz_axes, terminals
 from minisplat_ref.interface.arguments import HelpFormatter, Parser
 from minisplat_ref.interface.reporting import markdown_table
 
@@ -21,6 +21,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "Gaussians of other programs": dialects.CASES,
     "terminals and processes": terminals.CASES,
     "meshes as glTF": meshes.CASES,
+    "axes of an SPZ": spz_axes.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

@@ -18,7 +18,7 @@ from minisplat_ref.io.ply_file import read_vertices
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
 from minisplat_ref.mechanisms.meshes.files import write_mesh
 
-UNLIT = {"KHR_materials_unlit": {}}
+UNLIT: dict[str, object] = {"KHR_materials_unlit": {}}
 LIT = 0.6  # of a light, for a program without that extension
 TETRAHEDRON = (
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),

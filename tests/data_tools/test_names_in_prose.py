@@ -23,6 +23,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9]*.py"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OF_FORMULAS = {"Im", "MAR", "Re", "adj", "arsinh", "ln", "softmax", "sum_cuv"}  # and no names of code
 OF_OTHERS = {
+    "SPZ_ADOBE_coordinate_system",  # a record of an SPZ
     "_torch_impl_2dgs",  # gsplat's module
     "aabb_scale",  # a key of instant-ngp
     "applied_transform",  # a key of Nerfstudio

@@ -18,6 +18,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, save_ply
 from minisplat_ref.io.formats import compressed_ply, glb, ksplat, sog, splat, spz
+from minisplat_ref.io.formats.axes import ours_from, turn
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.types import Gaussians
@@ -66,10 +67,7 @@ def encoded(format_, gaussians, level=0):
 
 def turned(gaussians):
     """The same about x by 180 degrees: what a program shows that takes the frame of an SPZ for that of a PLY."""
-    signs = np.array([1, -1, -1], np.float32)
-    quats = gaussians.quats * np.array([1, 1, -1, -1], np.float32)
-    rest = gaussians.sh_rest * spz.SIGNS[: gaussians.sh_rest.shape[1], None]
-    return gaussians._replace(means=gaussians.means * signs, quats=quats, sh_rest=rest)
+    return turn(gaussians, ours_from("RUB"))
 
 
 def check_same(theirs, ours, rotation=SAME_ROTATION):
@@ -93,6 +91,37 @@ def test_splat_transform_reads_what_we_write(format_, level, splat_transform, tm
     if format_ is SPZ and not np.allclose(theirs.means, ours.means, atol=1e-3):
         theirs = turned(theirs)  # since its version 3
     check_same(theirs, ours, ROTATIONS.get(format_.suffix, SAME_ROTATION))
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_an_spz_of_splat_transform_is_its_ply_with_the_right_axes(version, splat_transform, tmp_path):
+    """RUB up to its version 2, RDF in its version 3; in both directions, and never both."""
+    save_ply(tmp_path / "from.ply", mild())
+    options = ("--spz-version", version) if version == 3 else ()
+    splat_transform(*options, tmp_path / "from.ply", tmp_path / "theirs.spz")
+    content = (tmp_path / "theirs.spz").read_bytes()
+
+    def is_where_it_was(gaussians):
+        distances = np.linalg.norm(gaussians.means[:, None] - mild().means[None], axis=2)  # its order is another
+        return distances.min(axis=0).max() < 0.01
+
+    axes = [axes for axes in ("RUB", "RDF") if is_where_it_was(spz.decode(content, "theirs", axes))]
+    assert len(axes) == 1
+    (tmp_path / "ours.spz").write_bytes(spz.encode(mild(), spz.VERSIONS.index(version), *axes))
+    splat_transform(tmp_path / "ours.spz", tmp_path / "back.ply")
+    assert is_where_it_was(load_ply(tmp_path / "back.ply"))
+
+
+def test_gsply_keeps_the_axes_of_the_ply(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gsply = pytest.importorskip("gsply", reason="needs gsply: pip install gsply")
+    (tmp_path / "ours.spz").write_bytes(spz.encode(mild(), 0, "RDF"))
+    data = gsply.read_spz(str(tmp_path / "ours.spz"))
+    assert_allclose(data.means, mild().means, atol=2.0**-11)
+    gsply.write_spz(str(tmp_path / "theirs.spz"), data)
+    theirs = spz.decode((tmp_path / "theirs.spz").read_bytes(), "theirs", "RDF")
+    assert_allclose(theirs.means, mild().means, atol=2.0**-11)
 
 
 def test_splat_transform_reads_our_ply(splat_transform, tmp_path):

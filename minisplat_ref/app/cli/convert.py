@@ -29,6 +29,10 @@ Compact formats have levels of precision, of which 0 is the finest:
                   on at most 24 training views of the run, or of --scene
 """
 EPILOG = """\
+Programs disagree about the axes of an .spz: RUB by its specification (x right,
+y up, z backward), those of the PLY, RDF, in others. --axes names them: of the
+.spz that is read, or of the one that is written if none is read.
+
 If a run has not ended, its newest whole checkpoint is converted.
 
 examples:
@@ -61,6 +65,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
     )
+    parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
     parser.set_defaults(run=run)
 
 
@@ -75,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
     format_ = choose_format(out)
     if args.max_drop is None and (args.scene is not None or args.downscale is not None):
         raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
-    source = open_source(args.input, args.extension)
+    of_input, format_ = _share_axes(args.axes, args.input, format_)
+    source = open_source(args.input, args.extension, of_input)
     if format_ is None:
         options = ("max_bytes", "max_drop", "level")
         if given := [name for name in options if getattr(args, name) is not None]:
@@ -100,6 +106,24 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _share_axes(axes: str | None, path: Path, format_: "Format | None") -> "tuple[str | None, Format | None]":
+    """Return the axes of the input, and the format of the output with its own.
+
+    Raises
+    ------
+    InputError
+        Axes are named, and neither file is of a format with a choice, or there are no such axes.
+    """
+    from minisplat_ref.extensions.extension import find_format
+
+    of_input = None if path.is_dir() else find_format(path)
+    if axes is None or (of_input is not None and of_input.with_axes is not None):
+        return axes, format_
+    if format_ is None or format_.with_axes is None:
+        raise InputError("--axes is for an .spz, whose programs disagree, and neither file is one: leave it out")
+    return None, format_.with_axes(axes)
+
+
 def _write_page(args: argparse.Namespace) -> int:
     """Write the model as a page that shows it, and print how to open it."""
     from minisplat_ref.app.runs.model_source import open_source
@@ -112,7 +136,7 @@ def _write_page(args: argparse.Namespace) -> int:
     options = ("max_bytes", "max_drop", "level", "scene", "downscale")
     if given := [name for name in options if getattr(args, name) is not None]:
         raise InputError(f"a page has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out")
-    source = open_source(path, args.extension)
+    source = open_source(path, args.extension, axes=args.axes)
     trained = source.trained
     population = trained.model.gaussians
     if further := [name for name in population._fields if name not in Gaussians._fields]:

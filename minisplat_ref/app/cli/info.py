@@ -48,6 +48,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("path", type=Path, metavar="FILE", help="any of the above")
     parser.add_argument("--model", metavar="M", help="folder of the COLMAP model in a scene (default sparse/0)")
+    parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
     parser.set_defaults(run=run)
 
 
@@ -60,6 +61,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--model is for a scene with a COLMAP model, and {path} is none: leave it out")
     if not path.exists():
         raise InputError(f"{path} does not exist: give a file or folder to look into")
+    is_compact = path.is_file() and path.suffix not in (".ply", ".npz", ".json")
+    if args.axes is not None and not is_compact:
+        raise InputError(f"{path}: --axes is for .spz, whose programs disagree about them: leave it out")
     if path.suffix == ".ply":
         rows = _ply_rows(path)
     elif path.suffix == ".npz":
@@ -69,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     elif path.is_dir() or path.suffix == ".json":
         rows = _scene_rows(path, args.model)
     else:
-        rows = _compact_rows(path)
+        rows = _compact_rows(path, args.axes)
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         print(f"{name:<{width}}  {value}")
@@ -105,7 +109,8 @@ def _label_rows(label: "Label") -> Rows:
     return [*rows, *([("lacks", f"{describe_parts(label.lacks)} of its run")] if label.lacks else [])]
 
 
-def _compact_rows(path: Path) -> Rows:
+def _compact_rows(path: Path, axes: str | None) -> Rows:
+    from minisplat_ref.app.runs.model_file import format_with_axes
     from minisplat_ref.extensions.extension import all_formats, find_format
     from minisplat_ref.io.formats import label_of, read_content
 
@@ -115,6 +120,7 @@ def _compact_rows(path: Path) -> Rows:
         raise InputError(
             f"{path} is none of .ply, checkpoint .npz, run folder, scene folder, transforms.json, {suffixes}"
         )
+    format_ = format_with_axes(path, axes) or format_
     content = read_content(path)
     fields = format_.decode(content, path)._asdict()
     label = _label_rows(label_of(path, format_, content))

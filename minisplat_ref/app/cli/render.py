@@ -75,6 +75,7 @@ def add_parser(commands: Commands) -> None:
         "--environment", type=Path, metavar="FILE", help="other light by latitude and longitude: image or .npy"
     )
     parser.add_argument("--extension", metavar="E", help="draws a file; core is 3DGS (default: what it names)")
+    parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
     parser.add_argument(
         "--frames", type=integer(1), default=60, metavar="N", help="number of images of an orbit (default 60)"
     )
@@ -116,6 +117,7 @@ def run(args: argparse.Namespace) -> int:
         args.input,
         args.extension,
         args.environment,
+        args.axes,
         background=args.background,
         profile=args.profile,
         backend=args.backend,

@@ -47,6 +47,7 @@ def add_parser(commands: Commands) -> None:
         "--film", type=Path, metavar="FILE", help="that keyframes are written to, .gif or .mp4 (default view.gif)"
     )
     parser.add_argument("--extension", metavar="E", help="draws a file; core is 3DGS (default: what it names)")
+    parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
     parser.add_argument(
         "--environment", type=Path, metavar="FILE", help="other light by latitude and longitude: image or .npy"
     )
@@ -71,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         path,
         args.extension,
         args.environment,
+        args.axes,
         background=args.background,
         profile=args.profile,
         backend=args.backend,

@@ -51,7 +51,7 @@ class Choice(NamedTuple):
     """dB of PSNR that are lost; None where it was not measured."""
 
 
-def open_source(path: Path, extension: str | None = None) -> Source:
+def open_source(path: Path, extension: str | None = None, axes: str | None = None) -> Source:
     """Read a model from a run folder, a checkpoint, a PLY or a compact file.
 
     Parameters
@@ -59,6 +59,8 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     path : Path
     extension : str, optional
         The one that renders a file, instead of the one in its label; runs and checkpoints have theirs.
+    axes : str, optional
+        Those of an .spz, instead of those that it names.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def open_source(path: Path, extension: str | None = None) -> Source:
         return _open_checkpoint(path) if is_checkpoint else _open_run(path)
     if not path.exists():
         raise InputError(f"{path} does not exist: give a run folder, a checkpoint, a PLY or a compact file")
-    read = read_model(path, extension)
+    read = read_model(path, extension, axes)
     return Source(Model(read.population), read.owner, path.name, frame_of_means(read.population.means), read.label)
 
 

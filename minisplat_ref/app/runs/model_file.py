@@ -1,5 +1,6 @@
 """A model's file: the extension that renders it, from its label, and the parts of its run that it lacks."""
 
+import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -9,6 +10,7 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions import VARIABLE, folders
 from minisplat_ref.extensions.extension import CORE, Extension, find_format, load_extension
 from minisplat_ref.io import formats
+from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label, warn_of_another
 from minisplat_ref.io.ply import further_properties, read_label
 from minisplat_ref.training.compensation import COMPENSATION
@@ -123,7 +125,23 @@ def choose_owner(path: Path, label: Label, given: Extension | None, why: str) ->
     return given
 
 
-def read_population(path: Path, owner: Extension) -> Any:
+def format_with_axes(path: Path, axes: str | None) -> Format | None:
+    """Return the format of a file, with the axes that the user names; None for a PLY.
+
+    Raises
+    ------
+    InputError
+        Axes are named for a format whose files all have the same, or there are no such axes.
+    """
+    format_ = find_format(path)
+    if axes is None:
+        return format_
+    if format_ is None or format_.with_axes is None:
+        raise InputError(f"{path}: --axes is for .spz, whose programs disagree about them: leave it out")
+    return format_.with_axes(axes)
+
+
+def read_population(path: Path, owner: Extension, format_: Format | None = None) -> Any:
     """Read the population of a PLY or of a compact file.
 
     Parameters
@@ -132,22 +150,28 @@ def read_population(path: Path, owner: Extension) -> Any:
         A file with an unknown suffix is read as a PLY.
     owner : Extension
         The owner of the population, for a PLY; ``CORE`` for the six fields.
+    format_ : Format, optional
+        That of the file, by default the one of its suffix; a line on stderr reports the axes that it chooses.
 
     Raises
     ------
     InputError
         The file is damaged or missing, or lacks an array that the extension needs.
     """
-    format_ = find_format(path)
+    format_ = format_ or find_format(path)
     if format_ is None:
         return owner.load(path, owner.representation.population)
     if owner.representation.population is not Gaussians and not owner.saves_plain:
         fields = ", ".join(set(owner.representation.population._fields) - set(Gaussians._fields))
         raise InputError(f"{path}: {format_.suffix} does not hold {fields} of extension {owner.name}: give a PLY")
-    return format_.decode(formats.read_content(path), path)
+    content = formats.read_content(path)
+    population = format_.decode(content, path)
+    if format_.describe_axes is not None:
+        print(f"minisplat-ref: {path} is read with the axes {format_.describe_axes(content, path)}", file=sys.stderr)
+    return population
 
 
-def read_model(path: Path, extension: str | None = None) -> ModelFile:
+def read_model(path: Path, extension: str | None = None, axes: str | None = None) -> ModelFile:
     """Read a PLY or a compact file on its own; warn about parts that it lacks, and about parts that are left out.
 
     Parameters
@@ -155,19 +179,22 @@ def read_model(path: Path, extension: str | None = None) -> ModelFile:
     path : Path
     extension : str, optional
         The one that renders it, ``core`` for 3DGS; by default the one recorded in the file.
+    axes : str, optional
+        Those of an .spz, instead of those that it names.
 
     Raises
     ------
     InputError
         The file is damaged or missing, its extension is not installed, or an array is missing that the extension needs.
     """
+    format_ = format_with_axes(path, axes)
     label = find_label(path)
     given = None
     if extension is not None:
         given = CORE if extension == CORE.name else load_extension(extension)
     owner = choose_owner(path, label, given, f"--extension {extension}")
-    population = read_population(path, owner)
-    if owner is CORE and find_format(path) is None and (further := further_properties(path)):
+    population = read_population(path, owner, format_)
+    if owner is CORE and format_ is None and (further := further_properties(path)):
         way_out = "" if given is CORE else ": --extension E says what they belong to"
         _warn(f"{path} also has {', '.join(further)}, which are left out{way_out}")
     if label.lacks:

@@ -35,7 +35,9 @@ class Source(NamedTuple):
         return self.path / name if self.path.is_dir() else self.path.with_name(f"{self.path.stem}-{name}")
 
 
-def open_source(path: Path, extension: str | None = None, environment: Path | None = None, **given: Any) -> Source:
+def open_source(
+    path: Path, extension: str | None = None, environment: Path | None = None, axes: str | None = None, **given: Any
+) -> Source:
     """Open a run, a PLY or a compact file.
 
     Parameters
@@ -46,6 +48,8 @@ def open_source(path: Path, extension: str | None = None, environment: Path | No
         The one that renders a file, ``core`` for 3DGS; by default the one recorded in the file.
     environment : Path, optional
         Other light for a model that is lit.
+    axes : str, optional
+        Those of an .spz, instead of those that it names.
     **given
         ``background``, ``profile`` and ``backend`` instead of the run's; None counts as not given.
 
@@ -56,7 +60,9 @@ def open_source(path: Path, extension: str | None = None, environment: Path | No
     """
     if not path.exists():
         raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
-    source = _open_run(path, extension) if path.is_dir() else _open_file(path, extension)
+    if axes is not None and path.is_dir():
+        raise InputError(f"{path}: --axes is for .spz, whose programs disagree about them: leave it out")
+    source = _open_run(path, extension) if path.is_dir() else _open_file(path, extension, axes)
     given = {name: value for name, value in given.items() if value is not None}
     if environment is not None:
         given["model"] = relight(source.trained.model, environment)
@@ -71,8 +77,8 @@ def _open_run(folder: Path, extension: str | None) -> Source:
     return Source(load_trained(folder), cameras, folder, frame)
 
 
-def _open_file(path: Path, extension: str | None) -> Source:
-    read = read_model(path, extension)
+def _open_file(path: Path, extension: str | None, axes: str | None) -> Source:
+    read = read_model(path, extension, axes)
     frame = frame_of_means(read.population.means)
     model = place_model(Model(read.population), read.owner, frame)
     trained = Trained(model, read.owner.representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")

@@ -48,6 +48,11 @@ class Format(NamedTuple):
     goes into a sidecar."""
     read_label: Callable[[bytes, str | Path], Label] | None = None
     """``read_label(content, source)``: the label of ``write_label``, ``NO_LABEL`` without one. Raises InputError."""
+    with_axes: Callable[[str], "Format"] | None = None
+    """``with_axes(name)``: the format for files with these axes (:mod:`.axes`); None where all files have the same.
+    Raises InputError."""
+    describe_axes: Callable[[bytes, str | Path], str] | None = None
+    """``describe_axes(content, source)``: the axes that a file is read with, and why. Raises InputError."""
 
 
 def read_content(path: str | Path) -> bytes:

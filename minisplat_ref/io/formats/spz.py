@@ -18,23 +18,25 @@ Colours, scales and harmonics outside their ranges are clipped. Of the fractiona
 that centres reach 2048; fewer if one is further away, more if the Gaussians are so small that they would move by much
 of their size. Values that neither version can hold are refused.
 
-**Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
-down, z forward). Niantic's library converts one to the other on request; we always do, in agreement
-with a sample of three Gaussians in both formats. y and z change sign, which is a rotation by 180 degrees around x. So
-the y and z of a quaternion change sign, and so do the harmonics that are odd in y and z together, which :data:`SIGNS`
-derives from their polynomials. Programs disagree: splat-transform 2.7.1 reads what we write in the same way, 3.7.0 does
-not convert, and shows it turned by 180 degrees around x.
+**Axes.** The specification says RUB (x right, y up, z backward), as in OpenGL; a PLY of 3DGS has RDF (x right, y down,
+z forward). So y and z change sign, a rotation by 180 degrees around x (:mod:`.axes`). Programs disagree: Niantic's
+library converts on request only, its own converters of the first versions did not, and splat-transform reads and writes
+RUB up to 2.7.1 and the axes of the PLY in 3.7.0, as gsply does. A file says which it has only in the record
+``SPZ_ADOBE_coordinate_system``, which we read, in version 4 before the table and in others behind the Gaussians, and
+write with other axes than RUB in version 4. Without it they are RUB, unless the user names others.
 
 Opacities 0 and 1 have no logit. They are read as a quarter of a quantisation level away from the end.
 
-Left out are version 1 (half floats), harmonics of degree 4, which are dropped with a warning, records of vendors, and
-the flag that a scene was trained with antialiasing, which is ignored when read and written as 0.
+Left out are version 1 (half floats), harmonics of degree 4, which are dropped with a warning, other records of
+vendors, and the flag that a scene was trained with antialiasing, which is ignored when read and written as
+0.
 """
 
 import math
 import struct
 import warnings
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +48,7 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.formats import Format, spz_streams
+from minisplat_ref.io.formats.axes import AXES, OURS, check_axes, describe_axes, ours_from, turn
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
@@ -61,13 +64,14 @@ SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
 BLOCK = 1 << 20  # bytes between two moves of the progress bar
 GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
 HEADER = struct.Struct("<IIIBBBB")
+_NUMBER = struct.Struct("<I")
 WAY_OUT = "copy or export the file again"
 BYTES_OF_REST = (0, 9, 24, 45, 72)  # by degree
 
-# Signs of the harmonics of degree 1 to 3 under (x, y, z) -> (x, -y, -z), by whether their polynomials are odd in y and
-# z together: y, z, x; xy, yz, 2zz-xx-yy, xz, xx-yy; y(3xx-yy), xyz, y(4zz-xx-yy), z(..), x(..), z(xx-yy), x(xx-3yy).
-SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-_AXES = np.array([1, -1, -1], np.float32)
+SPECIFIED = "RUB"
+COORDINATE_SYSTEM = 0xADBE0003  # the record SPZ_ADOBE_coordinate_system: its place in AXES, from 1, as uint32; 0: none
+RECORD = struct.Struct("<II")
+RECORDS_MAX = 1 << 16  # bytes that are looked through
 
 
 class _Header(NamedTuple):
@@ -75,6 +79,8 @@ class _Header(NamedTuple):
     n: int
     sh_degree: int
     fractional_bits: int
+    axes: str | None
+    """According to a record; None where there is none."""
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -84,7 +90,7 @@ class _Header(NamedTuple):
         return {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": rotation, "sh_rest": rest}
 
 
-def encode(gaussians: Gaussians, level: int) -> bytes:
+def encode(gaussians: Gaussians, level: int, axes: str = SPECIFIED) -> bytes:
     """Return the content of a file that holds the Gaussians.
 
     Parameters
@@ -93,6 +99,8 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         In the world frame of a PLY.
     level : int
         0 writes version 3, 1 version 4, 2 version 2.
+    axes : str
+        Those of the file; version 4 has a record of others than RUB.
 
     Raises
     ------
@@ -101,12 +109,13 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     """
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
-    means = gaussians.means.astype(np.float64) * _AXES
+    gaussians = turn(gaussians, ours_from(axes).T)
+    means = gaussians.means.astype(np.float64)
     fractional_bits = _fractional_bits(means, gaussians.log_scales)
     steps = np.floor(means * 2.0**fractional_bits + 0.5)  # [N, 3]
     opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
-    quats = gaussians.quats.astype(np.float64) * np.concatenate([[1.0], _AXES])
-    sh_rest = 128.0 * gaussians.sh_rest * SIGNS[:n_rest, None]  # [N, K-1, 3]
+    quats = gaussians.quats.astype(np.float64)
+    sh_rest = 128.0 * gaussians.sh_rest  # [N, K-1, 3]
     version = VERSIONS[level]
     parts = (
         steps.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
@@ -118,7 +127,8 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     )
     sh_degree = math.isqrt(n_rest + 1) - 1
     if version == spz_streams.VERSION:
-        return spz_streams.pack(n, sh_degree, fractional_bits, (part.tobytes() for part in parts))
+        record = b"" if axes == SPECIFIED else RECORD.pack(COORDINATE_SYSTEM, 4) + _NUMBER.pack(AXES.index(axes) + 1)
+        return spz_streams.pack(n, sh_degree, fractional_bits, (part.tobytes() for part in parts), record)
     header = HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0)
     compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
     content = header + b"".join(part.tobytes() for part in parts)
@@ -215,7 +225,7 @@ def _from_smallest_three(raw: NDArray[np.uint8]) -> Floats:
     return np.roll(xyzw, 1, axis=1)
 
 
-def decode(content: bytes, source: str | Path) -> Gaussians:
+def decode(content: bytes, source: str | Path, axes: str | None = None) -> Gaussians:
     """Return the Gaussians of a file, float32, in the world frame of a PLY.
 
     Parameters
@@ -224,6 +234,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         The whole file.
     source : str or Path
         Its name, for messages.
+    axes : str, optional
+        Those that the file has; by default what it says itself, and RUB if it says nothing.
 
     Raises
     ------
@@ -243,7 +255,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     steps: Ints = words.view("<i4")[..., 0] >> 8  # [N, 3]
     levels = np.clip(raw["opacities"][:, 0].astype(np.float64), 0.25, 254.75)  # [N]
     unpack_rotations: Any = _from_vector if header.version == 2 else _from_smallest_three
-    n_rest = min(header.sizes["sh_rest"] // 3, len(SIGNS))
+    n_rest = min(header.sizes["sh_rest"] // 3, (SH_DEGREE_MAX + 1) ** 2 - 1)
     if header.sh_degree > SH_DEGREE_MAX:
         message = f"{source}: its harmonics of degree {header.sh_degree} are cut off at degree {SH_DEGREE_MAX}"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
@@ -251,14 +263,15 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         raw["sh_rest"].reshape(header.n, header.sizes["sh_rest"] // 3, 3)[:, :n_rest].astype(np.float32) - 128
     ) / 128
     fields = (
-        steps * 2.0**-header.fractional_bits * _AXES,
-        unpack_rotations(raw["rotations"]) * np.concatenate([[1.0], _AXES]),
+        steps * 2.0**-header.fractional_bits,
+        unpack_rotations(raw["rotations"]),
         raw["scales"] / 16.0 - 10.0,
         np.log(levels / (255.0 - levels)),
         (raw["colors"] / 255.0 - 0.5) / COLOR_SCALE,
-        sh_rest * SIGNS[:n_rest, None],
+        sh_rest,
     )
     gaussians = Gaussians(*(field.astype(np.float32) for field in fields))
+    gaussians = turn(gaussians, ours_from(axes or header.axes or SPECIFIED))
     check_gaussians(gaussians, source)
     return gaussians
 
@@ -267,7 +280,8 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
     """Return the header and all that follows it, after checking the header."""
     if content[:4] == struct.pack("<I", MAGIC):
         streams = spz_streams.parse(content, source)
-        header = _Header(spz_streams.VERSION, streams.n, streams.sh_degree, streams.fractional_bits)
+        axes = _recorded_axes(streams.records, source)
+        header = _Header(spz_streams.VERSION, streams.n, streams.sh_degree, streams.fractional_bits, axes)
         _check_header(header, source)
         return header, spz_streams.unpack(streams, header.sizes, source)
     if content[:2] != b"\x1f\x8b":
@@ -275,20 +289,36 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
     head, _ = _inflate(content, HEADER.size, source)
     if len(head) < HEADER.size or HEADER.unpack(head)[0] != MAGIC:
         raise InputError(f"{source}: not an SPZ file, its content does not begin with NGSP; {WAY_OUT}")
-    _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
+    _, version, n, degree, fractional_bits, flags, _ = HEADER.unpack(head)
     if version not in GZIPPED:
         raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2, 3 or 4")
-    header = _Header(version, n, degree, fractional_bits)
+    header = _Header(version, n, degree, fractional_bits, None)
     _check_header(header, source)
     n_bytes = HEADER.size + n * sum(header.sizes.values())
     if n_bytes > min(GZIP_RATIO_MAX * len(content), memory.free_bytes()):
         raise InputError(f"{source}: {n:,} Gaussians cannot be in {len(content):,} packed bytes; {WAY_OUT}")
-    body, is_whole = _inflate(content, n_bytes, source)
+    body, is_whole = _inflate(content, n_bytes + (RECORDS_MAX if flags & spz_streams.HAS_RECORDS else 0), source)
     if len(body) < n_bytes or not is_whole:
         raise InputError(
             f"{source}: truncated, {n_bytes:,} bytes and their end expected, {len(body):,} found; {WAY_OUT}"
         )
-    return header, body[HEADER.size :]
+    header = header._replace(axes=_recorded_axes(body[n_bytes:], source))
+    return header, body[HEADER.size : n_bytes]
+
+
+def _recorded_axes(records: bytes, source: str | Path) -> str | None:
+    """Return the axes that the records of vendors name; None if none does, or it leaves them open."""
+    begin = 0
+    while begin + RECORD.size <= len(records):
+        kind, length = RECORD.unpack_from(records, begin)
+        begin += RECORD.size
+        if kind == COORDINATE_SYSTEM and length == _NUMBER.size and begin + length <= len(records):
+            (number,) = _NUMBER.unpack_from(records, begin)
+            if number > len(AXES):
+                raise InputError(f"{source}: its record of axes has the number {number}, of {len(AXES)}; {WAY_OUT}")
+            return AXES[number - 1] if number else None
+        begin += length
+    return None
 
 
 def _check_header(header: _Header, source: str | Path) -> None:
@@ -311,8 +341,22 @@ def _inflate(content: bytes, n_bytes: int, source: str | Path) -> tuple[bytes, b
         raise InputError(f"{source}: damaged, it cannot be unpacked ({error}); {WAY_OUT}") from None
 
 
-def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return the version of a file and the error bounds of its values, as pairs of name and text.
+def describe_file_axes(content: bytes, source: str | Path, axes: str | None = None) -> str:
+    """Return the axes that a file is read with, and why, in a few words; arguments and errors as for :func:`decode`."""
+    header, _ = _parse(content, source)
+    return _describe_axes(header, axes)
+
+
+def _describe_axes(header: _Header, axes: str | None) -> str:
+    if axes is not None:
+        return f"{describe_axes(axes)}, as --axes says"
+    if header.axes is not None:
+        return f"{describe_axes(header.axes)}, as its header says"
+    return f"{describe_axes(SPECIFIED)}, as the specification says; --axes {OURS} if that turns the scene about x"
+
+
+def describe(content: bytes, source: str | Path, axes: str | None = None) -> list[tuple[str, str]]:
+    """Return version, axes and error bounds of the values of a file, as pairs of name and text.
 
     Raises
     ------
@@ -322,11 +366,29 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
     header, _ = _parse(content, source)
     return [
         ("SPZ version", str(header.version)),
+        ("axes", _describe_axes(header, axes)),
         ("centres", f"within {2.0 ** (-header.fractional_bits - 1):.3g} world units along each axis"),
         ("scales", f"within {100 * math.expm1(1 / 32):.2g} %, between e^-10 and e^5.94"),
         ("opacities", f"within {0.5 / 255:.2g}"),
         ("SH coefficients", f"within {0.5 / 255 / COLOR_SCALE:.2g} (degree 0), {4 / 128:.2g} and {8 / 128:.2g}"),
     ]
+
+
+def with_axes(axes: str) -> Format:
+    """Return the format for files with these axes, whatever they say.
+
+    Raises
+    ------
+    InputError
+        There are no such axes.
+    """
+    axes = check_axes(axes)
+    return SPZ._replace(
+        encode=partial(encode, axes=axes),
+        decode=partial(decode, axes=axes),
+        describe=partial(describe, axes=axes),
+        describe_axes=partial(describe_file_axes, axes=axes),
+    )
 
 
 SPZ = Format(
@@ -337,5 +399,7 @@ SPZ = Format(
     encode=encode,
     decode=decode,
     describe=describe,
+    with_axes=with_axes,
+    describe_axes=describe_file_axes,
 )
 """The format that other programs read, too."""

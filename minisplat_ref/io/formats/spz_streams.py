@@ -7,7 +7,7 @@
     number of streams                       uint8
     offset of the table                     uint32
     reserved                                12 bytes
-    records of vendors                      up to the table, if flag 2 is set; not read
+    records of vendors                      up to the table, if flag 2 is set: type, bytes, 2 x uint32, content
     table                                   for each stream: bytes packed, bytes unpacked, 2 x uint64
     streams                                 one zstandard frame each
 
@@ -26,6 +26,7 @@ from minisplat_ref.io.packing.container import pack_frame, unpack_frame
 MAGIC = 0x5053474E  # "NGSP"
 VERSION = 4
 HEADER = struct.Struct("<IIIBBBBI12x")
+HAS_RECORDS = 2  # flag
 ENTRY = struct.Struct("<QQ")
 WAY_OUT = "copy or export the file again"
 
@@ -40,10 +41,12 @@ class Streams(NamedTuple):
     """Packed, in the order of the file."""
     sizes: tuple[int, ...]
     """Bytes of each, unpacked, according to the table."""
+    records: bytes
+    """Of vendors."""
 
 
-def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes]) -> bytes:
-    """Return the content of a file, without records of vendors.
+def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes], records: bytes = b"") -> bytes:
+    """Return the content of a file.
 
     Parameters
     ----------
@@ -51,6 +54,8 @@ def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes]) -
         Of the header.
     parts : iterable of bytes
         The six streams, in the order of the file.
+    records : bytes
+        Of vendors.
 
     Raises
     ------
@@ -59,9 +64,10 @@ def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes]) -
     """
     parts = list(parts)
     frames = [pack_frame(part) for part in parts]
-    header = HEADER.pack(MAGIC, VERSION, n, sh_degree, fractional_bits, 0, len(parts), HEADER.size)
+    flags, begin = HAS_RECORDS if records else 0, HEADER.size + len(records)
+    header = HEADER.pack(MAGIC, VERSION, n, sh_degree, fractional_bits, flags, len(parts), begin)
     table = [ENTRY.pack(len(frame), len(part)) for frame, part in zip(frames, parts, strict=True)]
-    return b"".join([header, *table, *frames])
+    return b"".join([header, records, *table, *frames])
 
 
 def parse(content: bytes, source: str | Path) -> Streams:
@@ -74,7 +80,7 @@ def parse(content: bytes, source: str | Path) -> Streams:
     """
     if len(content) < HEADER.size:
         raise InputError(f"{source}: truncated, {len(content)} bytes are no header; {WAY_OUT}")
-    _, version, n, sh_degree, fractional_bits, _, n_streams, begin = HEADER.unpack_from(content)
+    _, version, n, sh_degree, fractional_bits, flags, n_streams, begin = HEADER.unpack_from(content)
     if version != VERSION:
         raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2, 3 or 4")
     end = begin + n_streams * ENTRY.size
@@ -84,11 +90,12 @@ def parse(content: bytes, source: str | Path) -> Streams:
     claimed, found = sum(packed for packed, _ in table), len(content) - end
     if claimed > found:
         raise InputError(f"{source}: truncated, {claimed:,} bytes of streams expected, {found:,} found; {WAY_OUT}")
+    records = content[HEADER.size : begin] if flags & HAS_RECORDS else b""
     frames = []
     for packed, _ in table:
         frames.append(content[end : end + packed])
         end += packed
-    return Streams(n, sh_degree, fractional_bits, tuple(frames), tuple(size for _, size in table))
+    return Streams(n, sh_degree, fractional_bits, tuple(frames), tuple(size for _, size in table), records)
 
 
 def unpack(streams: Streams, sizes: Mapping[str, int], source: str | Path) -> bytes:
