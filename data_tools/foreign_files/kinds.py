@@ -6,7 +6,18 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from data_tools.foreign_files import dialects, leftovers, masks, meshes, names, places, ranges, spz_axes, terminals
+from data_tools.foreign_files import (
+    dialects,
+    leftovers,
+    masks,
+    meshes,
+    names,
+    photographs,
+    places,
+    ranges,
+    spz_axes,
+    terminals,
+)
 from minisplat_ref.interface.arguments import HelpFormatter, Parser
 from minisplat_ref.interface.reporting import markdown_table
 
@@ -22,6 +33,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "terminals and processes": terminals.CASES,
     "meshes as glTF": meshes.CASES,
     "axes of an SPZ": spz_axes.CASES,
+    "suffixes of photographs": photographs.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

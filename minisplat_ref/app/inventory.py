@@ -6,15 +6,16 @@ models. Each may be intended, so none is refused; but a user who expects it to b
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref.datasets.photo_files import UNREAD_SUFFIXES
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import find_model, has_model, image_names
-from minisplat_ref.io.images import BY_PRODUCT, IMAGE_SUFFIXES
+from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, IMAGE_SUFFIXES
 from minisplat_ref.io.names import spelled_on_disk
 from minisplat_ref.io.ply import color_names
 from minisplat_ref.io.ply_file import property_names
@@ -33,6 +34,7 @@ SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 FRAME_KEYS = ("depth_file_path", "normal_file_path", "semantic_path")
 OTHER_SETS = ("transforms_val.json", "transforms_test.json", "transforms_train.json")
 CLOUDS = (*BLENDER_POINTS, "sparse_pc.ply", "pointcloud.ply", "point_cloud.ply", "points.ply")
+PHOTOGRAPHS = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 FOCAL_TOLERANCE, PLACE_TOLERANCE = 0.005, 0.02  # relative; two calibrations of the same photographs differ by less
 
 
@@ -78,18 +80,28 @@ def _take_from_colmap(path: Path, model: Path, scene: Scene) -> Inventory:
         *_own_splits((path, model)),
         *_disagreement(path, model, names, scene),
     ]
-    return Inventory(used, (*_without_camera(sorted(photographs - names)), *unused))
+    others = [*_without_camera(sorted(photographs - names)), *_unread(path / "images", photographs)]
+    return Inventory(used, (*others, *unused))
 
 
 def _without_camera(names: Sequence[str]) -> list[str]:
     return [f"without a camera: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"] if names else []
 
 
-def _list_images(folder: Path) -> set[str]:
+def _unread(folder: Path, photographs: Iterable[str]) -> list[str]:
+    """Name photographs of formats that are not read, but for those that are there in another format, too."""
+    stems = {Path(name).with_suffix("").as_posix() for name in photographs}
+    unread = _list_images(folder, UNREAD_SUFFIXES)
+    names = sorted(name for name in unread if Path(name).with_suffix("").as_posix() not in stems)
+    more = ", ..." if len(names) > 3 else ""
+    return [f"of formats that are not read: {', '.join(names[:3])}{more}"] if names else []
+
+
+def _list_images(folder: Path, suffixes: Collection[str] = PHOTOGRAPHS) -> set[str]:
     """Return the image files in a folder and below, by their names relative to it; hidden ones do not count."""
     if not folder.is_dir():
         return set()
-    paths = (file.relative_to(folder) for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
+    paths = (file.relative_to(folder) for file in folder.rglob("*") if file.suffix.lower() in suffixes)
     return {path.as_posix() for path in paths if not any(map(BY_PRODUCT.fullmatch, path.parts))}
 
 
@@ -213,7 +225,7 @@ def _take_from_transforms(path: Path) -> Inventory:
     photographs = set()
     for parent in sorted({Path(stem).parent for stem in stems}):
         for file in parent.iterdir() if parent.is_dir() else ():
-            if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.as_posix() not in masks:
+            if file.suffix.lower() in PHOTOGRAPHS and not file.name.startswith(".") and file.as_posix() not in masks:
                 photographs.add(file.with_suffix("").as_posix())
     photographs = {stem for stem in photographs if stem in stems or not MAPS.search(Path(stem).name)}
     used = f"{len(photographs & stems)} of {len(photographs)} photographs have cameras"
@@ -266,7 +278,7 @@ def _count_others(file: Path, stems: set[str]) -> int:
 def _stem(folder: Path, frame: Mapping[str, Any]) -> str:
     """Return the path of a frame's image without its suffix."""
     path = folder / frame["file_path"]
-    return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
+    return (path.with_suffix("") if path.suffix.lower() in PHOTOGRAPHS else path).as_posix()
 
 
 def _list_clouds(file: Path, transforms: Mapping[str, Any]) -> list[str]:

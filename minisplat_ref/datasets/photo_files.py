@@ -14,10 +14,13 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, readable_suffixes
 
 UNREAD_SUFFIXES = (
-    *(".avif", ".jxl"),
-    *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
+    *(".jxl", ".jxr", ".exr", ".hdr", ".psb"),
+    *(".dng", ".raw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl"),
+    *(".pef", ".srw", ".3fr", ".fff", ".erf", ".kdc", ".dcr", ".mrw", ".mef", ".mos", ".iiq", ".x3f", ".gpr"),
 )
-"""Formats of cameras that are not read."""
+"""Formats of photographs that are not read."""
+BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"GIF8", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ")
+"""First bytes of images of the usual formats."""
 MASKS = "masks"
 """Folder of masks next to the photographs."""
 SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
@@ -52,16 +55,33 @@ def list_images(folder: Path) -> list[Path]:
         problems.append(
             f"{len(others)} photographs of formats that are not read ({enumerate_names(others)}): convert them to JPEG"
         )
+    strange = [str(file) for file in photos if _is_image_of_another_name(folder / file)]
+    if strange:
+        problems.append(
+            f"{len(strange)} images whose names do not end like one ({enumerate_names(strange)}): rename them"
+        )
     left_out = Counter(by_product for file, by_product in by_products if file.suffix.lower() in suffixes)
     if left_out:
         names = enumerate_names([name if n == 1 else f"{name} with {n} images" for name, n in left_out.items()])
         problems.append(f"what is hidden or a by-product of other programs ({names})")
     if not files:
         instead = f", but {' and '.join(problems)}" if problems else ""
-        raise InputError(f"{folder}: no images in it (looked for {' '.join(suffixes)}){instead}")
+        raise InputError(f"{folder}: no images in it (looked for {' '.join(suffixes[:6])} and others){instead}")
     for problem in problems:
         warnings.warn(one_line(f"{folder}: leaving out {problem}"), InputWarning, stacklevel=2)
     return files
+
+
+def _is_image_of_another_name(file: Path) -> bool:
+    """Return whether a file begins like an image, though its suffix is not that of one."""
+    if file.suffix.lower() in (*readable_suffixes(), *UNREAD_SUFFIXES, *HEIF_SUFFIXES):
+        return False
+    try:
+        with file.open("rb") as opened:
+            begin = opened.read(16)
+    except OSError:
+        return False
+    return begin.startswith(BEGINNINGS) or (begin[:4] == b"RIFF" and begin[8:12] == b"WEBP")
 
 
 def _by_product(folder: Path, file: Path) -> str | None:

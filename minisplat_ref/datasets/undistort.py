@@ -8,9 +8,11 @@ in a transforms.json scene, where alpha is no mask, it is composited onto black.
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from minisplat_ref.io.colmap import colmap_photos, find_model, read_model, write
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
-from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
+from minisplat_ref.io.scene import Photo, build_reading, check_photo, check_pixels, read_view
 from minisplat_ref.io.transforms import find_frames, find_points, find_transforms, read_transforms
 from minisplat_ref.types import Camera
 
@@ -58,6 +60,8 @@ def undistort_scene(scene: Path, out: Path) -> None:
         if model is not None:
             photos = colmap_photos(scene, read_model(scene))
             _check_distorted(scene, photos)
+            for photo in with_progress(photos, "reading", "photographs"):
+                check_pixels(photo)  # COLMAP fills what is missing of a truncated file with gray
             undistort_colmap(scene, photos, folder)
         else:
             _undistort_transforms(files, folder)
@@ -91,13 +95,14 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
         model = Path(temporary, "model")
         model.mkdir()
         write_model(scene, model)
-        pycolmap.undistort_images(temporary, str(model), str(scene / "images"), jpeg_quality=quality)
+        with _without_stderr():
+            pycolmap.undistort_images(temporary, str(model), str(scene / "images"), jpeg_quality=quality)
         (out / "sparse").mkdir()
         shutil.move(Path(temporary, "images"), out / "images")
         shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")
     reading = build_reading(1, None, undistort=True, alpha_is_mask=True)
     for photo in with_progress(photos, "undistorting", "masks"):
-        # COLMAP does not write every format that the loader reads (not WebP), and gives no error.
+        # COLMAP does not write every format that the loader reads (not .webp, not .insp), and gives no error.
         is_missing = not (out / "images" / photo.file).is_file()
         if is_missing or _has_mask(photo):
             view = read_view(photo, photo.file, reading)
@@ -110,6 +115,20 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
     if missing:
         raise InputError(f"{scene}: COLMAP has not undistorted {', '.join(missing)}; export the model again")
     return written
+
+
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Discard what a library prints of files that it cannot write, which are written here."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _has_mask(photo: Photo) -> bool:

@@ -29,11 +29,20 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.types import Bools, Floats
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-"""Files that count as photographs."""
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".insp", ".webp", ".tif", ".tiff", ".bmp", ".dib", ".apng"),
+    *(".gif", ".ppm", ".pgm", ".pbm", ".pnm", ".pfm", ".tga", ".jp2", ".j2k", ".jpf", ".jpx", ".jpc", ".j2c", ".avif"),
+    *(".pcx", ".psd", ".qoi", ".sgi", ".ras"),
+)
+"""Files that count as photographs: what Pillow opens of images of pixels. Of several in one file the first counts."""
 
-HEIF_SUFFIXES = (".heic", ".heif")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 """Photographs of telephones, which pillow-heif reads, the extra ``heic``."""
+
+FORMATS_BY_SUFFIX = {".insp": "JPEG"}
+"""Formats of suffixes that Pillow does not know."""
+PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(equirectangular|cylindrical)", re.IGNORECASE)
+"""In a file's XMP data: it is a panorama."""
 
 BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)
 """Names of hidden files and folders, and of those that programs put next to photographs."""
@@ -57,6 +66,32 @@ MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as J
 def readable_suffixes() -> tuple[str, ...]:
     """Return the suffixes of photographs that can be read here, with those of packages that are installed."""
     return (*IMAGE_SUFFIXES, *(HEIF_SUFFIXES if find_spec("pillow_heif") else ()))
+
+
+def flat_size(path: str | Path) -> tuple[int, int]:
+    """Return width and height in pixels of a photograph, from the file's header alone.
+
+    Raises
+    ------
+    InputError
+        The file cannot be opened, or is a panorama.
+    """
+    with open_image(Path(path)) as image:
+        check_flat(image)
+        return image.size
+
+
+def check_flat(image: Image.Image) -> None:
+    """Refuse a panorama, which no pinhole and no lens shows, by what its data say of its projection."""
+    texts = [image.info.get(key, b"") for key in ("xmp", "XML:com.adobe.xmp")]
+    texts = [text.encode(errors="replace") if isinstance(text, str) else text for text in texts]
+    projections = [match[1].decode().lower() for text in texts if (match := PROJECTION.search(bytes(text)))]
+    if projections:
+        raise InputError(
+            f"{_source(image)}: a panorama ({projections[0]}), of which there is no pinhole view: cut flat views out of"
+            " it, for example by ffmpeg -i PANORAMA -vf v360=e:flat:yaw=Y:h_fov=90:v_fov=90 VIEW.jpg for Y = -90, 0, 90"
+            " and 180, and give those"
+        )
 
 
 @contextmanager
@@ -318,7 +353,8 @@ def write_image(path: str | Path, image: NDArray) -> None:
         if np.isnan(image).any():
             raise InputError(f"{path}: the image has {np.isnan(image).sum()} NaN values; nothing was written")
         image = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
-    image_format = Image.registered_extensions().get(Path(path).suffix.lower())
+    suffix = Path(path).suffix.lower()
+    image_format = Image.registered_extensions().get(suffix, FORMATS_BY_SUFFIX.get(suffix))
     if image_format is None:
         raise InputError(f"{path}: no image format has this suffix; use .png or .jpg")
     with replacing(path) as temporary:

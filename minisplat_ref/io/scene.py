@@ -24,7 +24,7 @@ from minisplat_ref.io.images import (
     check_n_pixels,
     composite_alpha,
     downscaled_size,
-    image_size,
+    flat_size,
     is_turned,
     mask_areas,
     read_image,
@@ -287,6 +287,12 @@ def read_view(photo: Photo, name: str, reading: Reading) -> View:
     return View(name, camera, image, mask, photo.point_ids, time=photo.time)
 
 
+def check_pixels(photo: Photo) -> None:
+    """Raise an InputError for a photograph that cannot be decoded to its end, or has not its camera's size."""
+    _camera(photo, build_reading(1, None, undistort=False, alpha_is_mask=True, as_photographed=True))
+    read_image(photo.path)
+
+
 def make_stored_view(photo: Photo, name: str, reading: Reading, shelf: Shelf) -> View:
     """Return the view of a photograph whose pixels are read on demand; now only the file's size is read."""
     camera = _camera(photo, reading)
@@ -306,7 +312,7 @@ def _path(photo: Photo, reading: Reading) -> Path:
 def _camera(photo: Photo, reading: Reading) -> Camera:
     """Return the view's camera, undistorted and downscaled; refuse a file whose size is not that of its camera."""
     camera, path = photo.camera, _path(photo, reading)
-    width, height = image_size(path)
+    width, height = flat_size(path)
     if path != photo.path:
         _check_downscaled(photo, width, height, reading.downscale)
         return rescale_camera(camera, width, height)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.images import IMAGE_SUFFIXES, PIXELS_MAX, image_size
+from minisplat_ref.io.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, PIXELS_MAX, image_size
 from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
 from minisplat_ref.io.names import is_file, nearby_path, spelled_on_disk
@@ -152,7 +152,7 @@ def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
 def _image_file(file: Path, file_path: str) -> Path | None:
     """Return a frame's image, relative to the JSON file; try suffixes if it has none. None if missing."""
     path = nearby_path(file, file_path)
-    names = (path.name, *(path.name + suffix for suffix in IMAGE_SUFFIXES))
+    names = (path.name, *(path.name + suffix for suffix in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)))
     candidates = (path.parent / spelled_on_disk(path.parent, name) for name in names)
     return next((candidate for candidate in candidates if is_file(candidate)), None)
 

@@ -19,8 +19,10 @@ from minisplat_ref.datasets.photo_files import MASKS, enumerate_names, list_imag
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.images import (
+    IMAGE_SUFFIXES,
     MASK_THRESHOLD,
     SAVE_OPTIONS,
+    check_flat,
     decode_pixels,
     open_image,
     read_mask,
@@ -123,6 +125,7 @@ def find_mask(source: Path, relative: Path) -> Path | None:
 def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> tuple[Group, Bools | None]:
     """Write the copy of a photograph; return its group, and its mask at the copy's size if it has one."""
     with open_image(file) as opened:
+        check_flat(opened)
         exif = _focal_exif(opened)
         pixels = decode_pixels(ImageOps.exif_transpose(opened))  # [H, W, 3 or 4], upright
     mask = None if pixels.shape[2] == 3 else pixels[..., 3] >= MASK_THRESHOLD
@@ -170,7 +173,8 @@ def _positive(value: object) -> float | None:
 def _warn_of_unused(source: Path, used: set[Path]) -> None:
     """Name the files in ``masks/`` in the folder of photographs that are no photograph's mask."""
     folder = source / MASKS
-    unused = sorted({file for file in folder.rglob("*.png") if not file.name.startswith(".")} - used)
+    files = {file for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES}
+    unused = sorted({file for file in files if not file.name.startswith(".")} - used)
     if unused:
         names = enumerate_names([file.relative_to(folder).as_posix() for file in unused])
         warnings.warn(
