@@ -9,12 +9,14 @@ from pathlib import Path
 from data_tools.foreign_files import (
     dialects,
     leftovers,
+    library,
     masks,
     meshes,
     names,
     photographs,
     places,
     ranges,
+    relatives,
     spz_axes,
     terminals,
 )
@@ -34,6 +36,8 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "meshes as glTF": meshes.CASES,
     "axes of an SPZ": spz_axes.CASES,
     "suffixes of photographs": photographs.CASES,
+    "Gaussians that 3DGS does not draw": relatives.CASES,
+    "warnings of the library": library.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

@@ -14,7 +14,6 @@ from PIL import Image
 from data_tools.foreign_files.dialects import as_version_4
 from data_tools.foreign_files.ksplat import write_ksplat
 from data_tools.fuzz.mutations import Choose, damage
-from minisplat_ref.app.inventory import take_inventory
 from minisplat_ref.app.runs import settings
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import CONFIG
@@ -26,6 +25,7 @@ from minisplat_ref.io import load_ply, load_scene, save_ply, viewpoints, write_i
 from minisplat_ref.io.formats import read_content
 from minisplat_ref.io.frames import place_scene
 from minisplat_ref.io.images import read_image
+from minisplat_ref.io.inventory import take_inventory
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.ply import load_points
 from minisplat_ref.io.ply_file import read_vertices, write_vertices

@@ -8,7 +8,6 @@
 :mod:`.viewer`        a scene in the browser, live or as one page
 :mod:`.reports`       pages, plots and images of results
 :mod:`.film`          images as a film
-:mod:`.inventory`     what is in the folder of a scene, and what of it is used
 :mod:`.listing_file`  a scene without its pixels as a file, for workers
 ===================== =============================================================================
 """

@@ -11,14 +11,8 @@ from collections import Counter
 from pathlib import Path
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, readable_suffixes
+from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, UNREAD_SUFFIXES, readable_suffixes
 
-UNREAD_SUFFIXES = (
-    *(".jxl", ".jxr", ".exr", ".hdr", ".psb"),
-    *(".dng", ".raw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl"),
-    *(".pef", ".srw", ".3fr", ".fff", ".erf", ".kdc", ".dcr", ".mrw", ".mef", ".mos", ".iiq", ".x3f", ".gpr"),
-)
-"""Formats of photographs that are not read."""
 BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"GIF8", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ")
 """First bytes of images of the usual formats."""
 MASKS = "masks"

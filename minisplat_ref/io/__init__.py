@@ -6,6 +6,7 @@ from pathlib import Path
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, list_colmap, load_colmap
 from minisplat_ref.io.images import read_image, write_image
+from minisplat_ref.io.inventory import warn_of_unused
 from minisplat_ref.io.ply import load_ply, load_points, save_ply
 from minisplat_ref.io.scene import Listing, build_reading, build_scene
 from minisplat_ref.io.transforms import (
@@ -61,10 +62,17 @@ def load_scene(
     ------
     InputError
         If there is nothing to load, or it cannot be loaded.
+
+    Warns
+    -----
+    InputWarning
+        Of what is in the folder and not used: photographs without a camera, masks that fit none, a larger model.
     """
     listing = list_scene(Path(path), test_every, model, offset)
     reading = build_reading(downscale, background, undistort, listing.alpha_is_mask, as_photographed)
-    return build_scene(listing, reading)
+    scene = build_scene(listing, reading)
+    warn_of_unused(Path(path), scene, model)
+    return scene
 
 
 def list_scene(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:

@@ -90,8 +90,12 @@ def load_colmap(
     InputError
         If a file is missing or damaged, a camera model is distorted, or an image does not fit its camera.
     """
+    from minisplat_ref.io.inventory import warn_of_unused  # which reads both kinds of scenes
+
     reading = build_reading(downscale, background, undistort, True, as_photographed)
-    return build_scene(list_colmap(Path(path), test_every, model), reading)
+    scene = build_scene(list_colmap(Path(path), test_every, model), reading)
+    warn_of_unused(Path(path), scene, model)
+    return scene
 
 
 def list_colmap(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:

@@ -39,6 +39,13 @@ IMAGE_SUFFIXES = (
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 """Photographs of telephones, which pillow-heif reads, the extra ``heic``."""
 
+UNREAD_SUFFIXES = (
+    *(".jxl", ".jxr", ".exr", ".hdr", ".psb"),
+    *(".dng", ".raw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl"),
+    *(".pef", ".srw", ".3fr", ".fff", ".erf", ".kdc", ".dcr", ".mrw", ".mef", ".mos", ".iiq", ".x3f", ".gpr"),
+)
+"""Formats of photographs that are not read."""
+
 FORMATS_BY_SUFFIX = {".insp": "JPEG"}
 """Formats of suffixes that Pillow does not know."""
 PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(equirectangular|cylindrical)", re.IGNORECASE)

@@ -10,6 +10,7 @@ Files are read by property name, so order, normals and extra properties do not m
 """
 
 import re
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.label import NO_LABEL, Label, from_comments, to_comments
 from minisplat_ref.io.ply_dialects import as_usual, renamed
 from minisplat_ref.io.ply_file import comments_of, count_rows, property_names, read_vertices, write_vertices
+from minisplat_ref.io.ply_foreign import describe_columns, describe_ranges
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
 
@@ -40,6 +42,9 @@ COLOR_NAMES = (
     SH_DC,
 )
 """Names of colours in the PLY files of different programs, upper case aside; the first that are there count."""
+
+OTHER_FIELDS = {"filter_3D": "filter_sigmas"}
+"""Columns of other programs that are fields of our extensions."""
 
 GRAY = 128  # colour of a point cloud that has none
 
@@ -66,8 +71,17 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     InputError
         If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, a zero quaternion, or an infinity other
         than those that :mod:`.ply_dialects` understands.
+
+    Warns
+    -----
+    InputWarning
+        Of columns that 3DGS does not draw, and of values that are hardly its own (:mod:`.ply_foreign`); not of those of
+        an extension that the file names.
     """
     columns = as_usual(path, read_vertices(path))
+    for theirs, ours in OTHER_FIELDS.items():
+        if ours in population._fields and ours not in columns and theirs in columns:
+            columns[ours] = columns[theirs]
     rest_names = _sh_rest_names(columns, path)
     further = {field: _further_names(columns, field) for field in population._fields if field not in Gaussians._fields}
     names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
@@ -90,7 +104,7 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     check_quats(path, quats)
     n, n_rest = len(quats), len(rest_names) // 3
     rest = stack(rest_names) if rest_names else np.zeros((n, 0), dtype)  # [N, 3 (K-1)], channel-major
-    return population(
+    read = population(
         means=stack(MEANS),
         quats=quats,
         log_scales=stack(SCALES),
@@ -102,6 +116,17 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
             for field, properties in further.items()
         },
     )
+    _warn_of_foreign(path, read)
+    return read
+
+
+def _warn_of_foreign(path: str | Path, population: Any) -> None:
+    """Warn of what is left out or unlikely."""
+    notes = describe_ranges(population)
+    if isinstance(population, Gaussians) and read_label(path).extension is None:
+        notes = [f"not drawn are {sentence}" for sentence in describe_columns(further_properties(path))] + notes
+    if notes:
+        warnings.warn(one_line(f"{path}: {'; '.join(notes)}"), InputWarning, stacklevel=3)
 
 
 def _further_names(columns: Iterable[str], field: str) -> tuple[str, ...]:

@@ -75,8 +75,12 @@ def load_transforms(
     InputError
         If a file is missing or malformed, no image exists, there is distortion, or an image does not fit its camera.
     """
+    from minisplat_ref.io.inventory import warn_of_unused  # which reads both kinds of scenes
+
     reading = build_reading(downscale, background, undistort, False, as_photographed)
-    return build_scene(list_transforms(Path(path), test_every), reading)
+    scene = build_scene(list_transforms(Path(path), test_every), reading)
+    warn_of_unused(Path(path), scene)
+    return scene
 
 
 def list_transforms(path: Path, test_every: int, offset: int = 0) -> Listing:

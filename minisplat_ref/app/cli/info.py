@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from minisplat_ref.io.label import Label
     from minisplat_ref.types import Floats
 
+TEST_EVERY = 8  # of the photographs one is a test view, as where nothing else is asked for
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations", "lpips_reason")  # of metrics.json: too long, or said elsewhere
 
 Rows = list[tuple[str, str]]
@@ -211,12 +212,14 @@ def _event_rows(folder: Path, settings: "Settings") -> Rows:
 
 
 def _scene_rows(path: Path, model: str | None) -> Rows:
-    from minisplat_ref.app.inventory import take_inventory
     from minisplat_ref.app.runs.notices import describe_exposures, describe_place, describe_sizes
-    from minisplat_ref.io import load_scene
+    from minisplat_ref.io import list_scene
     from minisplat_ref.io.frames import place_scene
+    from minisplat_ref.io.inventory import take_inventory
+    from minisplat_ref.io.scene import build_reading, build_scene
 
-    scene = load_scene(path, undistort=True, model=model)
+    listing = list_scene(path, TEST_EVERY, model)
+    scene = build_scene(listing, build_reading(1, None, True, listing.alpha_is_mask))
     place = describe_place(place_scene(scene))
     views = (*scene.train_views, *scene.test_views)
     focals = sorted(view.camera.fx for view in views)

@@ -8,8 +8,9 @@ from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.io import list_scene, load_scene
+from minisplat_ref.io import list_scene
 from minisplat_ref.io.frames import place_scene
+from minisplat_ref.io.scene import build_reading, build_scene
 from minisplat_ref.metrics.lpips import check_views, load_network
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
@@ -162,7 +163,8 @@ def check(plan: Plan) -> Scene:
 
 def load_fold(plan: Plan, fold: int = 0) -> Scene:
     """Load the scene as the trainings of a fold have it."""
-    return place_scene(load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every, offset=fold))
+    listing = list_scene(plan.scene, plan.test_every, offset=fold)
+    return place_scene(build_scene(listing, build_reading(plan.downscale, None, False, listing.alpha_is_mask)))
 
 
 def _check_folds(scene: Path, folds: int) -> None:

@@ -194,9 +194,8 @@ def read_model(path: Path, extension: str | None = None, axes: str | None = None
         given = CORE if extension == CORE.name else load_extension(extension)
     owner = choose_owner(path, label, given, f"--extension {extension}")
     population = read_population(path, owner, format_)
-    if owner is CORE and format_ is None and (further := further_properties(path)):
-        way_out = "" if given is CORE else ": --extension E says what they belong to"
-        _warn(f"{path} also has {', '.join(further)}, which are left out{way_out}")
+    if owner is CORE and format_ is None and label.extension is not None and (further := further_properties(path)):
+        _warn(f"{path} also has {', '.join(further)}, which are left out")
     if label.lacks:
         _warn(f"{path} does not hold {describe_parts(label.lacks)} of its run, which is drawn with it: give the run")
     is_as_recorded = owner.name == label.extension

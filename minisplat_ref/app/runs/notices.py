@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from minisplat_ref.app.inventory import take_inventory
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.io.frames import describe_frame
 from minisplat_ref.io.images import SIDE_MIN
+from minisplat_ref.io.inventory import warn_of_unused
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
 from minisplat_ref.strategy.track_gains import estimate_gains
 from minisplat_ref.types import FILE_FRAME, Model, Scene
@@ -54,10 +54,8 @@ def warn_of_scene(scene: Scene, *, is_dense: bool = False) -> None:
 
 def report_inventory(path: Path, scene: Scene, model: str | None) -> None:
     """Report how many photographs of a scene's folder have cameras; warn of files that are not used."""
-    inventory = take_inventory(path, scene, model)
-    if inventory.unused:
-        _warn(f"{path}: {inventory.line}")
-    else:
+    inventory = warn_of_unused(path, scene, model)
+    if not inventory.unused:
         print(f"{scene.name}: {inventory.line}")
 
 

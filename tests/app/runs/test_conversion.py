@@ -182,7 +182,7 @@ def test_further_fields_need_a_ply(run, tmp_path, one_line, capfd):
     save_ply(tmp_path / "labelled.ply", moving, Label("velocity"))
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "labelled.ply").read_bytes()
     convert(tmp_path / "moving.ply", tmp_path / "c.msz")
-    assert "also has velocities_0, velocities_1, velocities_2, which are left out" in capfd.readouterr().err
+    assert "not drawn are velocities_0, velocities_1, velocities_2" in capfd.readouterr().err
     line = one_line("render", tmp_path / "c.msz", "--extension", "velocity", "--out", tmp_path / "views")
     assert ".msz does not hold velocities of extension velocity" in line
 

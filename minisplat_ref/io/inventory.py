@@ -1,4 +1,4 @@
-"""The inventory of a scene's folder, with its used and its unused files: one line for ``info`` and ``train``.
+"""The inventory of a scene's folder, with its used and its unused files: one line for ``info``, a warning elsewhere.
 
 A scene loads without a mask whose name does not fit, without photographs that have no camera, and from the first of two
 models. Each may be intended, so none is refused; but a user who expects it to be used has to hear that it is not.
@@ -6,16 +6,16 @@ models. Each may be intended, so none is refused; but a user who expects it to b
 
 import math
 import re
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.datasets.photo_files import UNREAD_SUFFIXES
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.colmap import find_model, has_model, image_names
-from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, IMAGE_SUFFIXES
+from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, IMAGE_SUFFIXES, UNREAD_SUFFIXES
 from minisplat_ref.io.names import spelled_on_disk
 from minisplat_ref.io.ply import color_names
 from minisplat_ref.io.ply_file import property_names
@@ -66,6 +66,14 @@ def take_inventory(path: Path, scene: Scene, model: str | None = None) -> Invent
     """
     folder = find_model(path, model)
     return _take_from_transforms(path) if folder is None else _take_from_colmap(path, folder, scene)
+
+
+def warn_of_unused(path: Path, scene: Scene, model: str | None = None) -> Inventory:
+    """Warn of files in a scene's folder that are not used, in one line; arguments as for :func:`take_inventory`."""
+    inventory = take_inventory(path, scene, model)
+    if inventory.unused:
+        warnings.warn(one_line(f"{path}: {inventory.line}"), InputWarning, stacklevel=3)
+    return inventory
 
 
 def _take_from_colmap(path: Path, model: Path, scene: Scene) -> Inventory:
