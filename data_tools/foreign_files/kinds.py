@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from data_tools.foreign_files import (
+    cameras,
     dialects,
     leftovers,
     library,
@@ -38,6 +39,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "suffixes of photographs": photographs.CASES,
     "Gaussians that 3DGS does not draw": relatives.CASES,
     "warnings of the library": library.CASES,
+    "cameras of other programs": cameras.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

@@ -162,6 +162,11 @@ def read_model(path: Path, name: str | None = None) -> Any:
             f"{path}: no COLMAP model, looked for cameras.bin or cameras.txt in {' and '.join(MODEL_FOLDERS)};"
             f" to make one from photographs run `minisplat-ref sfm PHOTOS --out {path}`"
         )
+    return _read_folder(model)
+
+
+def _read_folder(model: Path) -> Any:
+    """Read the model in a folder."""
     is_binary = (model / "cameras.bin").is_file()
     if is_binary:
         for name, layout in BINARY_RECORDS.items():
@@ -224,11 +229,39 @@ def _mask_files(masks: Path) -> dict[str, Path]:
     return {file.relative_to(masks).as_posix().casefold(): file for file in reversed(files)}
 
 
+def model_cameras(folder: Path) -> dict[str, tuple[Camera, Lens | None]]:
+    """Return the cameras of a model's registered images with their lenses, by the images' names.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model itself; photographs are not needed.
+
+    Raises
+    ------
+    InputError
+        The model is damaged, or a camera has no pinhole view.
+    """
+    images = _read_folder(folder).images.values()
+    return {
+        name: (_camera(folder, name, image), _lens(image.camera))
+        for name, image in ((_name(folder, image), image) for image in images if image.has_pose)
+    }
+
+
 def _photo(
     path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, Ints] | None, masks: Mapping[str, Path]
 ) -> Photo:
     """Return a registered image of the model, with the points that it sees if there are tracks."""
     candidates = (f"{name}.png", Path(name).with_suffix(".png").as_posix())
+    mask_path = next((masks[c.casefold()] for c in candidates if c.casefold() in masks), None)
+    point_ids = None if seen is None else seen.get(image.image_id, np.zeros(0, np.int64))
+    camera = _camera(path, name, image)
+    return Photo(folder, spelled_on_disk(folder, name), mask_path, camera, _lens(image.camera), point_ids)
+
+
+def _camera(path: Path, name: str, image: Any) -> Camera:
+    """Return pose and pinhole of a registered image."""
     pose = image.cam_from_world().matrix()  # [3, 4]
     model = image.camera
     if len(model.focal_length_idxs()) == 0:  # asking it for a focal length would abort the process
@@ -236,7 +269,7 @@ def _photo(
             f"{path}: {name} has camera model {model.model.name}, a panorama, of which there is no pinhole view;"
             " cut pinhole views out of it and run COLMAP on those"
         )
-    camera = Camera(
+    return Camera(
         cam_from_world_R=np.ascontiguousarray(pose[:, :3]),
         cam_from_world_t=np.ascontiguousarray(pose[:, 3]),
         fx=model.focal_length_x,
@@ -246,9 +279,6 @@ def _photo(
         width=model.width,
         height=model.height,
     )
-    mask_path = next((masks[c.casefold()] for c in candidates if c.casefold() in masks), None)
-    point_ids = None if seen is None else seen.get(image.image_id, np.zeros(0, np.int64))
-    return Photo(folder, spelled_on_disk(folder, name), mask_path, camera, _lens(model), point_ids)
 
 
 def _lens(camera: Any) -> Lens | None:

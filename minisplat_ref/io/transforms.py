@@ -177,6 +177,27 @@ def _time(file: Path, frame: Mapping[str, Any]) -> float:
     return time
 
 
+def frame_camera(file: Path, frame: Mapping[str, Any]) -> tuple[Camera, Lens | None, float]:
+    """Return camera, lens and time of a frame; its image is looked at only for a size that the file does not have.
+
+    Parameters
+    ----------
+    file : Path
+    frame : mapping
+        With the entries of the top level that it does not override.
+
+    Raises
+    ------
+    InputError
+        An entry makes no sense, or there is no size.
+    """
+    image_file = _image_file(file, frame["file_path"])
+    if image_file is None and not {"w", "h"} <= frame.keys():
+        raise InputError(f"{file}: {frame['file_path']} has no w and h, and is not there to be measured; add them")
+    camera, lens = _camera(file, frame, image_file or file)
+    return camera, lens, _time(file, frame)
+
+
 def _photo(file: Path, frame: Mapping[str, Any], image_file: Path) -> Photo:
     """Return one frame's photograph; ``frame`` includes the top level's entries that it does not override."""
     mask_path = _named_file(file, frame, "mask_path") if frame.get("mask_path") else None

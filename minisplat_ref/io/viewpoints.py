@@ -70,13 +70,18 @@ def read(path: Path) -> list[Viewpoint]:
     InputError
         The file cannot be read, or a camera lacks a value or has one that makes no sense.
     """
-    entries = read_json(path, "give the cameras as 3DGS's cameras.json does")
+    return from_json(path, read_json(path, "give the cameras as 3DGS's cameras.json does"))
+
+
+def from_json(path: Path, entries: Any) -> list[Viewpoint]:
+    """Return the viewpoints of a parsed ``cameras.json``; errors as for :func:`read`."""
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} does not hold a list of cameras (the layout of 3DGS's cameras.json)")
-    return [_viewpoint(entry, f"{path}, camera {index}") for index, entry in enumerate(entries)]
+    return [to_viewpoint(entry, f"{path}, camera {index}") for index, entry in enumerate(entries)]
 
 
-def _viewpoint(entry: Any, where: str) -> Viewpoint:
+def to_viewpoint(entry: Any, where: str) -> Viewpoint:
+    """Return one camera of a ``cameras.json``; ``where`` names it in errors, which are those of :func:`read`."""
     if not isinstance(entry, dict):
         raise InputError(f"{where} is not an object; {NEEDED}")
     missing = [key for key in ("position", "rotation", "width", "height", "fx", "fy") if key not in entry]

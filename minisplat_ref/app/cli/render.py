@@ -36,7 +36,10 @@ Cameras, by --cameras:
                      stand all around; a circle around a PLY (its default)
   FILE.json          list of cameras, as in the cameras.json of 3DGS: img_name,
                      width, height, position, rotation (world_from_camera),
-                     fx, fy and, if the principal point is off centre, cx, cy
+                     fx, fy and, if the principal point is off centre, cx, cy;
+                     nerfstudio's camera_path.json, a transforms.json,
+                     SuperSplat's poses, instant-ngp's base_cam.json
+  FOLDER             a COLMAP model, or a scene that has one
 """
 EPILOG = """\
 examples:
@@ -81,7 +84,10 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--arc", type=_arc, metavar="A", help="degrees of an orbit (default: what was photographed)")
     parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="of an orbit's images (default: the run's, or 640x480)"
+        "--size",
+        type=_size,
+        metavar="WxH",
+        help="of images whose cameras have none (default: the run's, or 640x480)",
     )
     parser.add_argument(
         "--film", type=Path, metavar="FILE", help="also a film: .gif, .mp4 (imageio[ffmpeg]); --fps F (25)"
@@ -233,7 +239,8 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
 
 def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint]":
     from minisplat_ref.app.runs.model_source import place_viewpoints
-    from minisplat_ref.io import orbits, viewpoints
+    from minisplat_ref.io import orbits
+    from minisplat_ref.io.camera_files import read_cameras
 
     which: str = args.cameras or ("test" if source.cameras else "orbit")
     if which == "orbit":
@@ -243,7 +250,9 @@ def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint
         means = source.trained.model.gaussians.means
         return orbits.orbit(means, followed, args.frames, width, height, args.arc)
     if which not in RUN_CAMERAS:
-        return place_viewpoints(viewpoints.read(Path(which)), source.frame)
+        like = source.cameras[0].camera if source.cameras else None
+        size = args.size or ((like.width, like.height) if like else ORBIT_SIZE)
+        return place_viewpoints(read_cameras(Path(which), size), source.frame)
     if not source.cameras:
         raise InputError(f"--cameras {which} needs a run folder: give --cameras orbit or a JSON file with {args.input}")
     views = [view for view in source.cameras if which in ("all", view.split)]
