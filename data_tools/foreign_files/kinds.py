@@ -9,6 +9,7 @@ from pathlib import Path
 from data_tools.foreign_files import (
     cameras,
     dialects,
+    headers,
     leftovers,
     library,
     masks,
@@ -40,6 +41,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "Gaussians that 3DGS does not draw": relatives.CASES,
     "warnings of the library": library.CASES,
     "cameras of other programs": cameras.CASES,
+    "headers, models, copies and videos": headers.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

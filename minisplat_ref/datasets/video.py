@@ -5,6 +5,7 @@ the mean square of the Laplacian of the brightness: between frames of one place 
 different places cannot be compared.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -20,6 +21,8 @@ from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.images import DAMAGE_ERRORS, write_image
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".gif")
+AUDIO, PICTURE = re.compile(r"Stream #\S+.*: Audio:"), re.compile(r"Stream #\S+.*: Video:")
+CAUSE = re.compile(r"moov atom not found|Invalid data found when processing input|No such file or directory", re.I)
 SECONDS = 0.5  # of a video, from which one frame is kept
 
 
@@ -85,9 +88,21 @@ def _read(video: Path, every: int | None) -> tuple[Iterator[NDArray[np.uint8]], 
     try:
         about = next(stream)  # of the whole video; frames follow
     except (*DAMAGE_ERRORS, StopIteration) as error:
-        raise InputError(one_line(f"{video}: not a video that ffmpeg reads ({error}); export it as MP4")) from error
+        raise InputError(f"{video}: {_reason(str(error), video)}; export it as MP4") from error
     per_second = max(float(about["fps"]), 1.0)
     return _frames(stream, about["size"], video), max(1, round(SECONDS * per_second)) if every is None else every
+
+
+def _reason(log: str, video: Path) -> str:
+    """Return why ffmpeg does not read a file, from what it printed, of which most is about itself."""
+    if AUDIO.search(log) and not PICTURE.search(log):
+        return "it has sound and no picture"
+    lines = [line.strip() for line in log.splitlines()]
+    named = [line.partition(str(video))[2].lstrip(": ") for line in lines if line.startswith(("Error opening", "[in#"))]
+    causes = [line for line in lines if CAUSE.search(line)]
+    cause = CAUSE.search(causes[0]) if causes else None
+    reason = cause[0] if cause else next((text for text in named if text), "it is damaged or of another kind")
+    return f"not a video that ffmpeg reads ({reason})"
 
 
 def _frames(stream: Any, size: tuple[int, int], video: Path) -> Iterator[NDArray[np.uint8]]:

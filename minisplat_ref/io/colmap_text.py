@@ -1,4 +1,4 @@
-"""COLMAP models that pycolmap cannot read unchanged: byte order marks, names with spaces, no sparse points.
+"""COLMAP models that pycolmap cannot read unchanged: byte order marks, names with spaces, no sparse points, no frames.
 
 The files are copied without these parts, and pycolmap reads the copies; the names come from here.
 """
@@ -23,7 +23,10 @@ def readable(model: Path) -> Iterator[Path]:
     points = next((name for name in NO_POINTS if f"cameras{Path(name).suffix}" in files), "points3D.txt")
     if points not in files:
         texts[points] = NO_POINTS[points]
-    if not texts:
+    halves = [suffix for suffix in (".bin", ".txt") if (f"rigs{suffix}" in files) != (f"frames{suffix}" in files)]
+    for suffix in halves:  # pycolmap needs both; without either, each image has the pose in the file of images
+        files = {name: file for name, file in files.items() if name not in (f"rigs{suffix}", f"frames{suffix}")}
+    if not texts and not halves:
         yield model
         return
     with tempfile.TemporaryDirectory(prefix="model-") as temporary:

@@ -39,6 +39,9 @@ IMAGE_SUFFIXES = (
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 """Photographs of telephones, which pillow-heif reads, the extra ``heic``."""
 
+PHOTOGRAPHS = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+"""All of these, whether their packages are installed or not."""
+
 UNREAD_SUFFIXES = (
     *(".jxl", ".jxr", ".exr", ".hdr", ".psb"),
     *(".dng", ".raw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl"),

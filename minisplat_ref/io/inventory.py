@@ -15,12 +15,14 @@ import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.colmap import find_model, has_model, image_names
-from minisplat_ref.io.images import BY_PRODUCT, HEIF_SUFFIXES, IMAGE_SUFFIXES, UNREAD_SUFFIXES
+from minisplat_ref.io.images import BY_PRODUCT, PHOTOGRAPHS, UNREAD_SUFFIXES
 from minisplat_ref.io.names import spelled_on_disk
 from minisplat_ref.io.ply import color_names
 from minisplat_ref.io.ply_file import property_names
 from minisplat_ref.io.transforms import (
     BLENDER_POINTS,
+    SINGLE_FILE,
+    find_image,
     find_points,
     find_transforms,
     read_transforms,
@@ -34,7 +36,6 @@ SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 FRAME_KEYS = ("depth_file_path", "normal_file_path", "semantic_path")
 OTHER_SETS = ("transforms_val.json", "transforms_test.json", "transforms_train.json")
 CLOUDS = (*BLENDER_POINTS, "sparse_pc.ply", "pointcloud.ply", "point_cloud.ply", "points.ply")
-PHOTOGRAPHS = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 FOCAL_TOLERANCE, PLACE_TOLERANCE = 0.005, 0.02  # relative; two calibrations of the same photographs differ by less
 
 
@@ -285,7 +286,10 @@ def _count_others(file: Path, stems: set[str]) -> int:
 
 def _stem(folder: Path, frame: Mapping[str, Any]) -> str:
     """Return the path of a frame's image without its suffix."""
-    path = folder / frame["file_path"]
+    try:
+        path = find_image(folder / SINGLE_FILE, frame["file_path"]) or folder / frame["file_path"]
+    except InputError:  # a name that leads elsewhere is no photograph of the scene
+        path = folder / frame["file_path"]
     return (path.with_suffix("") if path.suffix.lower() in PHOTOGRAPHS else path).as_posix()
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.images import PHOTOGRAPHS
 
 CHARACTERS_MAX = 100  # in a file name without suffix; characters take up to four bytes, and file systems allow 255
 BYTES_MAX = 200
@@ -42,6 +43,19 @@ def spelled_on_disk(folder: Path, name: str) -> str:
     forms = [name, stem + suffix.lower(), stem + suffix.upper(), name.replace("\\", "/")]
     forms += [unquote(name), *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
     return next((form for form in forms if ".." not in Path(form).parts and is_file(folder / form)), name)
+
+
+def with_any_suffix(folder: Path, name: str) -> str:
+    """Return the name of an image's copy in a folder: as given, or of the same stem in another format if that is alone.
+
+    Programs that make photographs smaller also convert them; ``images_2/0001.jpg`` is then ``images_2/0001.png``.
+    """
+    given = spelled_on_disk(folder, name)
+    path = folder / given
+    if is_file(path) or not path.parent.is_dir():
+        return given
+    others = [file for file in path.parent.iterdir() if file.stem == path.stem and file.suffix.lower() in PHOTOGRAPHS]
+    return others[0].relative_to(folder).as_posix() if len(others) == 1 else given
 
 
 def name_inside(name: str, source: str | Path) -> str:

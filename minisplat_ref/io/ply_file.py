@@ -30,7 +30,8 @@ COUNT_TYPES = [name for name, code in SCALAR_TYPES.items() if code[0] != "f"]
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")  # names of a face's list in different programs; we write the first
 ROWS_AT_ONCE = 1 << 16  # assembled for writing
-HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
+HEADER_LINE_MAX = 1 << 20  # bytes; no header line is longer, and a file without line breaks must not be read whole
+HEADER_MAX = 1 << 24  # bytes of a header
 
 
 class Property(NamedTuple):
@@ -200,7 +201,10 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     comments: list[str] = []
     words: list[str] = []
     while words != ["end_header"]:
-        words = file.readline(HEADER_LINE_MAX).decode(errors="replace").split()
+        line = file.readline(HEADER_LINE_MAX)
+        words = line.decode(errors="replace").split()
+        if line and not words and file.tell() < HEADER_MAX:
+            continue  # a blank line, or one of a carriage return alone
         match words:
             case ["end_header"]:
                 pass

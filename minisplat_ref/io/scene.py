@@ -33,7 +33,7 @@ from minisplat_ref.io.images import (
     resize_mask,
 )
 from minisplat_ref.io.lens import Lens, lens_optics, undistort, undistorted_pinhole
-from minisplat_ref.io.names import is_file
+from minisplat_ref.io.names import is_file, with_any_suffix
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
 
@@ -306,7 +306,7 @@ def _path(photo: Photo, reading: Reading) -> Path:
     """Return the file to read: a downscaled image if there is one, except with a lens, which needs the full size."""
     small_folder = photo.folder.with_name(f"{photo.folder.name}_{reading.downscale}")
     is_small = reading.downscale > 1 and photo.lens is None and small_folder.is_dir()
-    return small_folder / photo.file if is_small else photo.path
+    return small_folder / with_any_suffix(small_folder, photo.file) if is_small else photo.path
 
 
 def _camera(photo: Photo, reading: Reading) -> Camera:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, PIXELS_MAX, image_size
+from minisplat_ref.io.images import PHOTOGRAPHS, PIXELS_MAX, image_size
 from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
 from minisplat_ref.io.names import is_file, nearby_path, spelled_on_disk
@@ -34,6 +34,8 @@ from minisplat_ref.types import Camera, Floats, Scene
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
 SINGLE_FILE = "transforms.json"
 BLENDER_POINTS = ("points3d.ply", "points3D.ply")
+OTHER_MODELS = {"PERSPECTIVE": "PINHOLE", "FISHEYE": "OPENCV_FISHEYE", "FULLOPENCV": "FULL_OPENCV"}
+"""Names of camera models in other programs, by COLMAP's; upper and lower case are alike."""
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # factors of the camera's x, y and z axis
 NAMED_MISSING_MAX = 20  # missing images that a warning names; all of them would not be one line
 
@@ -131,7 +133,7 @@ def read_transforms(file: Path) -> dict[str, Any]:
 
 def find_frames(file: Path, transforms: Mapping[str, Any]) -> list[tuple[dict[str, Any], Photo]]:
     """Pair the frames of a file with their photographs; one warning names the images that do not exist."""
-    frames = [(frame, _image_file(file, frame["file_path"])) for frame in transforms["frames"]]
+    frames = [(frame, find_image(file, frame["file_path"])) for frame in transforms["frames"]]
     missing = [frame["file_path"] for frame, image_file in frames if image_file is None]
     if len(missing) == len(frames):
         raise InputError(f"{file}: none of its {len(frames)} images exists, first {missing[0]}; put them beside it")
@@ -153,10 +155,10 @@ def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def _image_file(file: Path, file_path: str) -> Path | None:
+def find_image(file: Path, file_path: str) -> Path | None:
     """Return a frame's image, relative to the JSON file; try suffixes if it has none. None if missing."""
     path = nearby_path(file, file_path)
-    names = (path.name, *(path.name + suffix for suffix in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)))
+    names = (path.name, *(path.name + suffix for suffix in PHOTOGRAPHS))
     candidates = (path.parent / spelled_on_disk(path.parent, name) for name in names)
     return next((candidate for candidate in candidates if is_file(candidate)), None)
 
@@ -191,7 +193,7 @@ def frame_camera(file: Path, frame: Mapping[str, Any]) -> tuple[Camera, Lens | N
     InputError
         An entry makes no sense, or there is no size.
     """
-    image_file = _image_file(file, frame["file_path"])
+    image_file = find_image(file, frame["file_path"])
     if image_file is None and not {"w", "h"} <= frame.keys():
         raise InputError(f"{file}: {frame['file_path']} has no w and h, and is not there to be measured; add them")
     camera, lens = _camera(file, frame, image_file or file)
@@ -246,7 +248,8 @@ def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Cam
     )
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = frame.get("camera_model", "OPENCV")
+    model = str(frame.get("camera_model", "OPENCV")).upper().replace("-", "_")
+    model = OTHER_MODELS.get(model, model)
     if frame.get("is_fisheye") or model == "OPENCV_FISHEYE":
         return camera, Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4))
     if model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS) or k4 != 0.0:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.errors import LINE_MAX, InputError
+from minisplat_ref.errors import LINE_MAX, InputError, InputWarning
 from minisplat_ref.io import load_ply, load_scene, read_image, viewpoints
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.lens import import_pycolmap
@@ -385,7 +385,8 @@ def test_transforms(tmp_path, refused, changes, reason):
     write_transforms(tmp_path, fl_x=40.0)
     edit_transforms(tmp_path / "transforms.json", lambda content: content["frames"][1].update(changes))
     if "file_path" in changes:  # a name that no file can have is a missing file
-        with pytest.warns(UserWarning, match="1 of 4 images are missing and skipped: x"):
+        unused = pytest.warns(InputWarning, match="3 of 4 photographs have cameras; without a camera: 0001")
+        with unused, pytest.warns(UserWarning, match="1 of 4 images are missing and skipped: x"):
             assert len(load_scene(tmp_path, test_every=0).train_views) == 3
     else:
         assert re.search(reason, refused(load_scene, tmp_path, undistort=True))

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io import load_scene, load_transforms
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import write_vertices
@@ -91,20 +91,23 @@ def test_folds_of_photographs_that_are_held_out_already(tmp_path, rng):
     write_blender(tmp_path, rng)
     with pytest.raises(InputError, match=r"transforms_test\.json says which .* give .*transforms_train\.json as"):
         load_scene(tmp_path, test_every=2, offset=1)
-    scene = load_scene(tmp_path / "transforms_train.json", test_every=3, offset=1)
+    with pytest.warns(InputWarning, match=r"transforms_test\.json is not used, 2 of its images are in no other file"):
+        scene = load_scene(tmp_path / "transforms_train.json", test_every=3, offset=1)
     assert [view.name for view in scene.test_views] == ["0001"]
 
 
 def test_blender_points(tmp_path, rng):
     write_blender(tmp_path, rng)
     write_vertices(tmp_path / "points3d.ply", {"x": np.array([1.0]), "y": np.array([2.0]), "z": np.array([3.0])})
-    np.testing.assert_array_equal(load_transforms(tmp_path).points, [[1, 2, 3]])
+    with pytest.warns(InputWarning, match=r"points3d\.ply has no red, green, blue: its points are gray"):
+        np.testing.assert_array_equal(load_transforms(tmp_path).points, [[1, 2, 3]])
 
 
 def test_points_that_are_not_finite(tmp_path):
     write_transforms(tmp_path, name="transforms_train.json", camera_angle_x=0.7)
     write_vertices(tmp_path / "points3d.ply", {name: np.array([np.nan, 2.0, 3.0]) for name in "xyz"})
-    with pytest.warns(UserWarning, match=r"points3d\.ply: 1 of 3 points are not finite and left out"):
+    gray = pytest.warns(InputWarning, match=r"points3d\.ply has no red, green, blue: its points are gray")
+    with gray, pytest.warns(UserWarning, match=r"points3d\.ply: 1 of 3 points are not finite and left out"):
         scene = load_transforms(tmp_path)
     np.testing.assert_array_equal(scene.points, [[2, 2, 2], [3, 3, 3]])
     assert (scene.point_colors == 128).all()
@@ -141,7 +144,8 @@ def test_intrinsics_per_frame_masks_and_points(tmp_path):
     edit_transforms(tmp_path / "transforms.json", change)
     write_image(tmp_path / "images" / "0001.png", colored_image(1, 16, HEIGHT))
     write_image(tmp_path / "masks" / "one.png", mask[:, :16])
-    scene = load_transforms(tmp_path)
+    with pytest.warns(InputWarning, match=r"sparse_pc\.ply has no red, green, blue: its points are gray"):
+        scene = load_transforms(tmp_path)
     views = views_of(scene)
     assert views["0001"].camera[2:8] == (50.0, 42.0, 14.0, 12.25, 16, HEIGHT)
     np.testing.assert_array_equal(views["0001"].mask, mask[:, :16])
