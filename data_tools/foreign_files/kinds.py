@@ -9,6 +9,7 @@ from pathlib import Path
 from data_tools.foreign_files import (
     cameras,
     dialects,
+    folders,
     headers,
     leftovers,
     library,
@@ -42,6 +43,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "warnings of the library": library.CASES,
     "cameras of other programs": cameras.CASES,
     "headers, models, copies and videos": headers.CASES,
+    "folders of other programs": folders.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.io.colmap import colmap_photos, find_model, read_model, write_model
+from minisplat_ref.io.colmap import colmap_photos, find_model, image_folder, read_model, write_model
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
@@ -96,7 +96,7 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
         model.mkdir()
         write_model(scene, model)
         with _without_stderr():
-            pycolmap.undistort_images(temporary, str(model), str(scene / "images"), jpeg_quality=quality)
+            pycolmap.undistort_images(temporary, str(model), str(image_folder(scene)), jpeg_quality=quality)
         (out / "sparse").mkdir()
         shutil.move(Path(temporary, "images"), out / "images")
         shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")

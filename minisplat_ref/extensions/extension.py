@@ -12,8 +12,9 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders, module_of
-from minisplat_ref.io.formats import Format
+from minisplat_ref.io.formats import UNBUNDLED, Format
 from minisplat_ref.io.formats.catalogue import FORMATS
+from minisplat_ref.io.formats.sog import SOG
 from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES
@@ -213,8 +214,10 @@ def find_format(path: str | Path) -> Format | None:
     InputError
         Two extensions have a format of that suffix.
     """
+    if Path(path).name == UNBUNDLED:
+        return SOG
     suffix = "".join(Path(path).suffixes[-2:]).lower()
-    if suffix in ("", ".ply"):  # which need no extension to be loaded
+    if suffix in ("", ".ply", ".csv"):  # which need no extension to be loaded
         return None
     found = [(format_, owner) for owner, format_ in all_formats() if suffix.endswith(format_.suffix)]
     if len(found) > 1:

@@ -7,6 +7,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, list_colmap, load_colmap
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.inventory import warn_of_unused
+from minisplat_ref.io.other_places import refuse_other_scene
 from minisplat_ref.io.ply import load_ply, load_points, save_ply
 from minisplat_ref.io.scene import Listing, build_reading, build_scene
 from minisplat_ref.io.transforms import (
@@ -79,10 +80,14 @@ def list_scene(path: Path, test_every: int, model: str | None = None, offset: in
     """Return everything that :func:`load_scene` reads but the photographs; arguments and errors are the same."""
     if not path.exists():
         raise InputError(f"{path}: no such folder; give the folder of a scene")
+    if path.is_file():
+        refuse_other_scene(path)
     if find_model(path, model) is not None:
         return list_colmap(path, test_every, model, offset)
     if find_transforms(path):
         return list_transforms(path, test_every, offset)
+    if path.is_dir():
+        refuse_other_scene(path)
     models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
     raise InputError(
         f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"

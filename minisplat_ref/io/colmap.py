@@ -25,6 +25,10 @@ from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, m
 from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
+OTHER_MODEL_FOLDERS = ("colmap/sparse/0", "distorted/sparse/0", "")
+"""Of ns-process-data, of 3DGS's convert.py before it undistorts, and a model alone; a transforms.json comes before."""
+TRANSFORMS = ("transforms_train.json", "transforms.json")
+IMAGE_FOLDERS = ("images", "input")
 POINTS_PLY = "points3D.ply"  # which 3DGS and its viewers write beside the model's points
 N_IMAGES = re.compile(r"# Number of images: (\d+)")  # in a model as text
 
@@ -136,7 +140,25 @@ def find_model(path: Path, name: str | None = None) -> Path | None:
                 f" to the scene{f', such as {found[0]}' if found else ''}"
             )
         return path / name
-    return next((f for f in (path / folder for folder in MODEL_FOLDERS) if has_model(f)), None)
+    folders = [path / folder for folder in MODEL_FOLDERS]
+    if not any((path / name).is_file() for name in TRANSFORMS):
+        folders += [path / folder for folder in OTHER_MODEL_FOLDERS]
+    return next((folder for folder in folders if has_model(folder)), None)
+
+
+def image_folder(path: Path) -> Path:
+    """Return the folder of the photographs of a scene; beside or above the model if that is all that is given.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    places = [path, *path.resolve().parents[:2]] if has_model(path) else [path]
+    found = next((p / name for p in places for name in IMAGE_FOLDERS if (p / name).is_dir()), None)
+    if found is None:
+        raise InputError(f"{path}: no folder images/; put the photographs there, named as in the model")
+    return found
 
 
 def image_names(model: Path) -> set[str]:
@@ -197,17 +219,15 @@ def write_model(path: Path, folder: Path) -> None:
     """Write the model of a scene as pycolmap reads it, with the names that the photographs have on disk."""
     reconstruction = read_model(path)
     for image in reconstruction.images.values():
-        image.name = spelled_on_disk(path / "images", _name(path, image))
+        image.name = spelled_on_disk(image_folder(path), _name(path, image))
     reconstruction.write_binary(str(folder))
 
 
 def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
     """List the registered images of a model, in no particular order."""
-    folder = path / "images"
-    if not folder.is_dir():
-        raise InputError(f"{path}: no folder images/; put the photographs there, named as in the model")
+    folder = image_folder(path)
     seen = _point_ids(reconstruction)
-    masks = _mask_files(path / "masks")
+    masks = _mask_files(folder.with_name("masks"))
     names = {image_id: _name(path, image) for image_id, image in reconstruction.images.items()}
     registered = [(names[image_id], image) for image_id, image in reconstruction.images.items() if image.has_pose]
     return [_photo(path, folder, name, image, seen, masks) for name, image in registered]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.colmap import find_model, has_model, image_names
+from minisplat_ref.io.colmap import find_model, has_model, image_folder, image_names
 from minisplat_ref.io.images import BY_PRODUCT, PHOTOGRAPHS, UNREAD_SUFFIXES
 from minisplat_ref.io.names import spelled_on_disk
 from minisplat_ref.io.ply import color_names
@@ -79,8 +79,9 @@ def warn_of_unused(path: Path, scene: Scene, model: str | None = None) -> Invent
 
 def _take_from_colmap(path: Path, model: Path, scene: Scene) -> Inventory:
     names = image_names(model)
-    photographs = _list_images(path / "images")
-    names = {spelled_on_disk(path / "images", name) for name in names}
+    folder = image_folder(path)
+    photographs = _list_images(folder)
+    names = {spelled_on_disk(folder, name) for name in names}
     n_placed = len(photographs & names)
     used = f"{n_placed} of {len(photographs)} photographs have cameras"
     unused = [
@@ -89,7 +90,7 @@ def _take_from_colmap(path: Path, model: Path, scene: Scene) -> Inventory:
         *_own_splits((path, model)),
         *_disagreement(path, model, names, scene),
     ]
-    others = [*_without_camera(sorted(photographs - names)), *_unread(path / "images", photographs)]
+    others = [*_without_camera(sorted(photographs - names)), *_unread(folder, photographs)]
     return Inventory(used, (*others, *unused))
 
 

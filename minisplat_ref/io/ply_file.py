@@ -31,6 +31,7 @@ BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": "
 CORNERS = ("vertex_indices", "vertex_index")  # names of a face's list in different programs; we write the first
 ROWS_AT_ONCE = 1 << 16  # assembled for writing
 HEADER_LINE_MAX = 1 << 20  # bytes; no header line is longer, and a file without line breaks must not be read whole
+TABLE = ".csv"  # of splat-transform, whose columns have the names of a PLY's
 HEADER_MAX = 1 << 24  # bytes of a header
 
 
@@ -98,6 +99,8 @@ def count_rows(path: str | Path, name: str) -> int:
         If the file cannot be opened or its header is malformed.
     """
     path = Path(path)
+    if path.suffix.lower() == TABLE:
+        return 0
     with open_ply(path) as file:
         return sum(element.n for element in read_header(file, path).elements if element.name == name)
 
@@ -112,6 +115,8 @@ def property_names(path: str | Path) -> tuple[str, ...]:
     """
     path = Path(path)
     with open_ply(path) as file:
+        if path.suffix.lower() == TABLE:
+            return _table_names(file, path)
         return read_header(file, path).vertices.dtype.names or ()
 
 
@@ -125,7 +130,7 @@ def comments_of(path: str | Path) -> Sequence[str]:
     """
     path = Path(path)
     with open_ply(path) as file:
-        return read_header(file, path).comments
+        return () if path.suffix.lower() == TABLE else read_header(file, path).comments
 
 
 def read_vertices(path: str | Path) -> dict[str, NDArray]:
@@ -143,6 +148,8 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     """
     path = Path(path)
     with open_ply(path) as file:
+        if path.suffix.lower() == TABLE:
+            return _read_table(file, path)
         header = read_header(file, path)
         if header.encoding == "ascii":
             with np.errstate(over="ignore"):  # values beyond their type become infinite, for which readers check
@@ -152,6 +159,31 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
                 pass_over(file, path, element)
             rows = _read_binary(file, path, header.vertices)
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
+
+
+def _table_names(file: BinaryIO, path: Path) -> tuple[str, ...]:
+    """Return the names in the first line of a table of splat-transform, between commas."""
+    names = tuple(name.strip() for name in file.readline(HEADER_LINE_MAX).decode("utf-8-sig", "replace").split(","))
+    if len(set(names)) < len(names) or not all(names) or len(names) < 2:
+        raise InputError(f"{path}: its first line is not names of columns between commas; export it again as .ply")
+    return names
+
+
+def _read_table(file: BinaryIO, path: Path) -> dict[str, NDArray]:
+    """Return the columns of a table of splat-transform, float32."""
+    names = _table_names(file, path)
+    rows: list[tuple[float, ...]] = []
+    for row, line in enumerate(file):
+        words = line.split(b",")
+        try:
+            rows.append(tuple(map(float, words)))
+        except ValueError:
+            raise InputError(f"{path}: row {row} is not {len(names)} numbers; export it again") from None
+        if len(words) != len(names):
+            raise InputError(f"{path}: row {row} is not {len(names)} numbers; export it again")
+    with np.errstate(over="ignore"):
+        table = np.array(rows, np.float64).reshape(-1, len(names)).astype(np.float32)
+    return {name: np.ascontiguousarray(column) for name, column in zip(names, table.T, strict=True)}
 
 
 def write_vertices(

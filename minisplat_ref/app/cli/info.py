@@ -55,17 +55,22 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table of names and values."""
+    from minisplat_ref.app.runs.model_file import find_file
     from minisplat_ref.app.runs.run_folder import CONFIG
+    from minisplat_ref.io.formats import UNBUNDLED
 
     path: Path = args.path
     if args.model is not None and not path.is_dir():
         raise InputError(f"--model is for a scene with a COLMAP model, and {path} is none: leave it out")
     if not path.exists():
         raise InputError(f"{path} does not exist: give a file or folder to look into")
-    is_compact = path.is_file() and path.suffix not in (".ply", ".npz", ".json")
+    path = find_file(path)
+    is_compact = path.is_file() and path.suffix not in (".ply", ".csv", ".npz", ".json")
     if args.axes is not None and not is_compact:
         raise InputError(f"{path}: --axes is for .spz, whose programs disagree about them: leave it out")
-    if path.suffix == ".ply":
+    if path.name == UNBUNDLED:
+        rows = _compact_rows(path, args.axes)
+    elif path.suffix in (".ply", ".csv"):
         rows = _ply_rows(path)
     elif path.suffix == ".npz":
         rows = _checkpoint_rows(path)

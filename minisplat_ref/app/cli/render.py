@@ -242,7 +242,7 @@ def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint
     from minisplat_ref.io import orbits
     from minisplat_ref.io.camera_files import read_cameras
 
-    which: str = args.cameras or ("test" if source.cameras else "orbit")
+    which: str = args.cameras or ("test" if any(view.split == "test" for view in source.cameras) else "orbit")
     if which == "orbit":
         like = source.cameras[0].camera if source.cameras else None
         width, height = args.size or ((like.width, like.height) if like else ORBIT_SIZE)

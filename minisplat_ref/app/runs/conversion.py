@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.runs.model_file import make_label, read_model
+from minisplat_ref.app.runs.model_file import find_file, make_label, read_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, owner_of
 from minisplat_ref.io.formats import Format, with_label
@@ -67,6 +67,7 @@ def open_source(path: Path, extension: str | None = None, axes: str | None = Non
     InputError
         It is none of these, or damaged, or ``extension`` is given where it is known.
     """
+    path = find_file(path) if path.exists() else path
     is_checkpoint = path.suffix == ".npz"
     if path.is_dir() or is_checkpoint:
         if extension is not None:

@@ -12,6 +12,7 @@ from minisplat_ref.extensions.extension import CORE, Extension, find_format, loa
 from minisplat_ref.io import formats
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label, warn_of_another
+from minisplat_ref.io.other_places import find_model_file
 from minisplat_ref.io.ply import further_properties, read_label
 from minisplat_ref.training.compensation import COMPENSATION
 from minisplat_ref.training.recipe_settings import configure_renderer, renderer_settings
@@ -56,6 +57,20 @@ def make_label(owner: Extension, shared: Iterable[str], settings: Mapping[str, s
     """
     settings_of_renderer = renderer_settings(owner.representation.renderer, settings)
     return owner.label._replace(lacks=missing_parts(shared), set=settings_of_renderer)
+
+
+def find_file(path: Path) -> Path:
+    """Return the file that a path of another program means, and say so on stderr if it is not the path itself.
+
+    Raises
+    ------
+    InputError
+        It is of a program whose models are not read.
+    """
+    found = find_model_file(path)
+    if found != path:
+        print(f"minisplat-ref: {path}: reading {found.relative_to(path)}", file=sys.stderr)
+    return found
 
 
 def find_label(path: Path) -> Label:

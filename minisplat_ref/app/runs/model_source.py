@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.app.runs import run_folder
-from minisplat_ref.app.runs.model_file import read_model
+from minisplat_ref.app.runs.model_file import find_file, read_model
 from minisplat_ref.app.runs.scoring import Trained, load_trained
 from minisplat_ref.app.runs.settings import load_frame, place_model
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -60,9 +60,10 @@ def open_source(
     """
     if not path.exists():
         raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
+    folder, path = path, find_file(path)
     if axes is not None and path.is_dir():
         raise InputError(f"{path}: --axes is for .spz, whose programs disagree about them: leave it out")
-    source = _open_run(path, extension) if path.is_dir() else _open_file(path, extension, axes)
+    source = _open_run(path, extension) if path.is_dir() else _open_file(path, extension, axes, folder)
     given = {name: value for name, value in given.items() if value is not None}
     if environment is not None:
         given["model"] = relight(source.trained.model, environment)
@@ -77,12 +78,14 @@ def _open_run(folder: Path, extension: str | None) -> Source:
     return Source(load_trained(folder), cameras, folder, frame)
 
 
-def _open_file(path: Path, extension: str | None, axes: str | None) -> Source:
+def _open_file(path: Path, extension: str | None, axes: str | None, folder: Path) -> Source:
     read = read_model(path, extension, axes)
     frame = frame_of_means(read.population.means)
     model = place_model(Model(read.population), read.owner, frame)
     trained = Trained(model, read.owner.representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
-    return Source(trained, [], path, frame)
+    cameras = folder / run_folder.CAMERAS  # of a folder that another program has left
+    views = place_viewpoints(viewpoints.read(cameras), frame) if folder.is_dir() and cameras.is_file() else []
+    return Source(trained, views, path, frame)
 
 
 def place_viewpoints(views: Sequence[Viewpoint], frame: Frame) -> list[Viewpoint]:

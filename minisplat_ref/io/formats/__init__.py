@@ -12,17 +12,22 @@ way is recorded in a file beside theirs (:mod:`minisplat_ref.io.label`).
 """
 
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.json_file import parse_json
 from minisplat_ref.io.label import NO_LABEL, Label, read_sidecar, write_sidecar
+from minisplat_ref.io.names import name_inside
 from minisplat_ref.types import Gaussians
 
 # The frame of glTF is LUF (x left, y up, z forward), that of a scene RDF: a rotation by 180 degrees about z.
+UNBUNDLED = "meta.json"  # of a SOG in a folder
 GLTF_AXES = np.array([-1, -1, 1], np.float32)
 
 
@@ -64,9 +69,31 @@ def read_content(path: str | Path) -> bytes:
         It cannot be read.
     """
     try:
-        return Path(path).read_bytes()
+        return bundle(Path(path)) if Path(path).name == UNBUNDLED else Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
+
+
+def bundle(meta: Path) -> bytes:
+    """Return a SOG that is not packed, the folder of its ``meta.json``, as the one file that it would be.
+
+    Raises
+    ------
+    InputError
+        An image that it names is not in the folder.
+    """
+    packed = BytesIO()
+    content = parse_json(meta.read_bytes(), meta, "export it again")
+    parts = content.values() if isinstance(content, dict) else []
+    lists = [part["files"] for part in parts if isinstance(part, dict) and isinstance(part.get("files"), list)]
+    names = [name for files in lists for name in files if isinstance(name, str)]
+    with ZipFile(packed, "w") as archive:
+        archive.writestr(UNBUNDLED, meta.read_bytes())
+        for name in dict.fromkeys(names):
+            if not (meta.parent / name_inside(name, meta)).is_file():
+                raise InputError(f"{meta}: {name} is not beside it; copy the whole folder")
+            archive.write(meta.parent / name, name)
+    return packed.getvalue()
 
 
 def write_content(path: str | Path, content: bytes) -> None:
