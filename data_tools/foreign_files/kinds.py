@@ -16,6 +16,7 @@ from data_tools.foreign_files import (
     masks,
     meshes,
     names,
+    outliers,
     photographs,
     places,
     ranges,
@@ -44,6 +45,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "cameras of other programs": cameras.CASES,
     "headers, models, copies and videos": headers.CASES,
     "folders of other programs": folders.CASES,
+    "Gaussians beyond a format": outliers.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

@@ -67,8 +67,9 @@ def read_cameras(path: Path, size: tuple[int, int]) -> list[Viewpoint]:
         if "frames" in content:
             return _of_transforms(path)
         sets = content.get("poseSets", [content])
-        poses = [one.get("poses") for one in sets if isinstance(one, dict)] if isinstance(sets, list) else []
-        if poses and all(isinstance(one, list) for one in poses):
+        found = [one.get("poses") for one in sets if isinstance(one, dict)] if isinstance(sets, list) else []
+        poses = [one for one in found if isinstance(one, list)]
+        if poses and len(poses) == len(found):
             return _numbered(path, [pose for one in poses for pose in one], _of_supersplat, size)
     if isinstance(content, list) and content and isinstance(content[0], dict):
         if "target" in content[0]:

@@ -22,7 +22,14 @@ from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.label import NO_LABEL, Label, from_comments, to_comments
 from minisplat_ref.io.ply_dialects import as_usual, renamed
-from minisplat_ref.io.ply_file import comments_of, count_rows, property_names, read_vertices, write_vertices
+from minisplat_ref.io.ply_file import (
+    comments_of,
+    count_rows,
+    property_names,
+    read_pieces,
+    read_vertices,
+    write_vertices,
+)
 from minisplat_ref.io.ply_foreign import describe_columns, describe_ranges
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
@@ -78,6 +85,9 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
         Of columns that 3DGS does not draw, and of values that are hardly its own (:mod:`.ply_foreign`); not of those of
         an extension that the file names.
     """
+    if population is Gaussians and (found := _load_in_pieces(Path(path))) is not None:
+        _warn_of_foreign(path, found)
+        return found
     columns = as_usual(path, read_vertices(path))
     for theirs, ours in OTHER_FIELDS.items():
         if ours in population._fields and ours not in columns and theirs in columns:
@@ -118,6 +128,38 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     )
     _warn_of_foreign(path, read)
     return read
+
+
+def _load_in_pieces(path: Path) -> Gaussians | None:
+    """Read a binary file with the usual properties into its fields, a few rows at a time, so that it is there once.
+
+    None for a file with other names, or with values that are not finite, of which the reader of columns knows more.
+    """
+    rest = [name for name in property_names(path) if name.startswith("f_rest_")]
+    n_rest = len(rest) // 3
+    names = (*MEANS, *SH_DC, *(f"f_rest_{i}" for i in range(3 * n_rest)), "opacity", *SCALES, *QUATS)
+    if 3 * n_rest != len(rest) or n_rest not in [(degree + 1) ** 2 - 1 for degree in range(SH_DEGREE_MAX + 1)]:
+        return None
+    found = read_pieces(path, names)
+    if found is None:
+        return None
+    n, dtype, pieces = found
+    shapes = ((3,), (4,), (3,), (), (3,), (n_rest, 3))
+    fields = Gaussians(*(np.empty((n, *shape), dtype) for shape in shapes))
+    start = 0
+    for rows in pieces:
+        part = slice(start, start + len(rows))
+        start += len(rows)
+        for field, group in ((0, MEANS), (1, QUATS), (2, SCALES), (4, SH_DC)):
+            for i, name in enumerate(group):
+                fields[field][part, i] = rows[name]
+        fields.opacity_logits[part] = rows["opacity"]
+        for i in range(3 * n_rest):
+            fields.sh_rest[part, i % n_rest, i // n_rest] = rows[f"f_rest_{i}"]
+        if not all(np.isfinite(field[part]).all() for field in fields):
+            return None
+    check_quats(path, fields.quats)
+    return fields
 
 
 def _warn_of_foreign(path: str | Path, population: Any) -> None:

@@ -5,7 +5,7 @@ and list properties are skipped; :mod:`.ply_faces` reads faces. Writing supports
 equally many corners.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -161,6 +161,48 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
 
 
+def read_pieces(path: Path, names: Collection[str]) -> tuple[int, np.dtype, Iterator[NDArray]] | None:
+    """Read the vertices of a binary file a few at a time, for a reader that puts them where they belong.
+
+    Parameters
+    ----------
+    path : Path
+    names : collection of str
+        Properties that must be there, as floats.
+
+    Returns
+    -------
+    tuple or None
+        The number of vertices, the result type of the properties, and structured arrays of rows, one after the other;
+        None for a file that :func:`read_vertices` has to read.
+
+    Raises
+    ------
+    InputError
+        If the file is malformed, or ends before its last declared vertex.
+    """
+    with open_ply(path) as file:
+        if path.suffix.lower() == TABLE:
+            return None
+        header = read_header(file, path)
+        kinds = {p.name: p.dtype for p in header.vertices.scalars}
+        is_usual = set(names) <= kinds.keys() and all(kinds[name].kind == "f" for name in names)
+        if header.encoding == "ascii" or header.before or header.vertices.has_lists or not is_usual:
+            return None
+        begin, vertices = file.tell(), header.vertices
+        _check_binary(file, path, vertices)
+    dtype = np.result_type(np.float32, *(kinds[name].newbyteorder("=") for name in names))
+    return vertices.n, dtype, _pieces(path, begin, vertices)
+
+
+def _pieces(path: Path, begin: int, vertices: Element) -> Iterator[NDArray]:
+    with open_ply(path) as file:
+        file.seek(begin)
+        for start in range(0, vertices.n, ROWS_AT_ONCE):
+            n = min(ROWS_AT_ONCE, vertices.n - start)
+            yield np.frombuffer(read_exactly(file, path, n * vertices.dtype.itemsize), vertices.dtype)
+
+
 def _table_names(file: BinaryIO, path: Path) -> tuple[str, ...]:
     """Return the names in the first line of a table of splat-transform, between commas."""
     names = tuple(name.strip() for name in file.readline(HEADER_LINE_MAX).decode("utf-8-sig", "replace").split(","))
@@ -292,6 +334,13 @@ def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
     n, dtype = vertices.n, vertices.dtype
     if vertices.has_lists:
         return np.frombuffer(b"".join(_read_row(file, path, vertices) for _ in range(n)), dtype)
+    _check_binary(file, path, vertices)
+    return np.frombuffer(file.read(n * dtype.itemsize), dtype)
+
+
+def _check_binary(file: BinaryIO, path: Path, vertices: Element) -> None:
+    """Refuse a binary file that ends before its last declared vertex, from where it is read."""
+    n, dtype = vertices.n, vertices.dtype
     found = max(0, path.stat().st_size - file.tell())
     expected = n * dtype.itemsize
     if found < expected:
@@ -299,7 +348,6 @@ def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
             f"{path}: truncated, {n} vertices of {dtype.itemsize} bytes need {expected} bytes but there are {found};"
             " copy or export the file again"
         )
-    return np.frombuffer(file.read(expected), dtype)
 
 
 def _read_row(file: BinaryIO, path: Path, element: Element) -> bytes:

@@ -65,13 +65,23 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
     )
+    parser.add_argument(
+        "--drop-outliers", action="store_true", help="leave out Gaussians that are far from all others, or far larger"
+    )
     parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and print its content."""
-    from minisplat_ref.app.runs.conversion import check_population, choose_format, encode_as, open_source
+    from minisplat_ref.app.runs.conversion import (
+        check_population,
+        choose_format,
+        describe_dropped,
+        drop_outliers,
+        encode_as,
+        open_source,
+    )
     from minisplat_ref.io.formats import write_file
 
     out: Path = args.output
@@ -82,6 +92,12 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
     of_input, format_ = _share_axes(args.axes, args.input, format_)
     source = open_source(args.input, args.extension, of_input)
+    if args.drop_outliers:
+        dropped = drop_outliers(source.model.gaussians)
+        source = source._replace(model=source.model._replace(gaussians=dropped.population))
+        if len(dropped.rows):
+            what = describe_dropped(dropped.rows)
+            print(f"minisplat-ref: {len(dropped.rows)} outliers are left out, {what}", file=sys.stderr)
     if format_ is None:
         options = ("max_bytes", "max_drop", "level")
         if given := [name for name in options if getattr(args, name) is not None]:

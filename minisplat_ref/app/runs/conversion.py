@@ -21,9 +21,11 @@ from minisplat_ref.io.ply import are_far
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
-from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Model, number_views
+from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Ints, Model, number_views
 
 VIEWS_MAX = 24
+OUTLIER_REACH = 1000.0  # extents of most of a scene; a sky of Gaussians is less than a hundred away
+ROWS_NAMED = 5  # that a message names
 NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are blended; 2e-7 has been seen
 
 
@@ -139,6 +141,38 @@ def check_population(population: Any, format_: Format, what: str) -> None:
         )
 
 
+class Dropped(NamedTuple):
+    """A population without its outliers."""
+
+    population: Any
+    rows: Ints
+    """Of the outliers."""
+
+
+def drop_outliers(population: Any) -> Dropped:
+    """Return a population without Gaussians that are far from all others or far larger than all of them.
+
+    Far is :data:`OUTLIER_REACH` times the extent of the middle 80 % of the centres, away from their median. The same
+    multiple of that extent is the size from which on a Gaussian is too large.
+    """
+    means = population.means.astype(np.float64)
+    if len(means) < 2:
+        return Dropped(population, np.zeros(0, np.int64))
+    low, middle, high = np.quantile(means, (0.1, 0.5, 0.9), axis=0)
+    reach = OUTLIER_REACH * max(float(np.linalg.norm(high - low)), np.finfo(np.float64).tiny)
+    is_far = np.linalg.norm(means - middle, axis=1) > reach
+    is_large = population.log_scales.max(axis=1) > np.log(reach)
+    is_outlier = is_far | is_large
+    kept = type(population)(*(field[~is_outlier] for field in population))
+    return Dropped(kept, np.flatnonzero(is_outlier))
+
+
+def describe_dropped(rows: Ints) -> str:
+    """Name the rows of outliers, the first few of them."""
+    named = ", ".join(map(str, rows[:ROWS_NAMED].tolist()))
+    return f"row {named}" if len(rows) == 1 else f"rows {named}{', ...' if len(rows) > ROWS_NAMED else ''}"
+
+
 def encode_as(format_: Format, path: Path, label: Label, gaussians: Gaussians, level: int) -> bytes:
     """Return the content of a file at one level, with its label if it has a place for it; an error names the file.
 
@@ -156,7 +190,9 @@ def encode_as(format_: Format, path: Path, label: Label, gaussians: Gaussians, l
     try:
         return with_label(format_, format_.encode(gaussians, level), label)
     except InputError as error:
-        raise InputError(f"{path} cannot be written: {error}") from None
+        rows = drop_outliers(gaussians).rows
+        way_out = f"; or leave out what is far from all others ({describe_dropped(rows)}) by --drop-outliers"
+        raise InputError(f"{path} cannot be written: {error}{way_out if len(rows) else ''}") from None
 
 
 def finest_within(gaussians: Gaussians, format_: Format, max_bytes: int) -> Choice:
