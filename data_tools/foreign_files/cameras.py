@@ -24,7 +24,7 @@ LEVELS = 2  # of 255, between renders whose cameras differ by rounding
 def views(seed: int, fov: float) -> list[tuple[Floats, Floats]]:
     """Return places, and rotations world_from_camera, of three cameras that look at the middle without rolling."""
     rng = np.random.default_rng(seed)
-    found = []
+    found: list[tuple[Floats, Floats]] = []
     for _ in range(3):
         position = rng.normal(size=3) * [1, 0.4, 1]
         position *= 3.5 / math.tan(math.radians(fov) / 2) / np.linalg.norm(position)
@@ -42,7 +42,7 @@ def focal(fov: float) -> float:
 
 def matrices(seed: int, fov: float) -> list[Floats]:
     """Return world_from_camera [4, 4] in OpenGL's axes."""
-    found = []
+    found: list[Floats] = []
     for position, rotation in views(seed, fov):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation @ FLIP, position
