@@ -137,13 +137,13 @@ def test_missing_frames_are_one_line_of_the_command(tmp_path, capsys):
 
 
 def test_other_warnings_keep_their_form(tmp_path, capsys, monkeypatch):
-    def warn(path, **_):
+    def warn(path, *_):
         warnings.warn("of a library", UserWarning, stacklevel=1)
         warnings.warn("of ours", InputWarning, stacklevel=1)
         raise InputError(f"{path}: enough")
 
     shown = []
-    monkeypatch.setattr(io, "load_scene", warn)
+    monkeypatch.setattr(io, "list_scene", warn)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         monkeypatch.setattr(warnings, "showwarning", lambda message, *_: shown.append(str(message)))
