@@ -29,9 +29,8 @@ Compact formats have levels of precision, of which 0 is the finest:
                   on at most 24 training views of the run, or of --scene
 """
 EPILOG = """\
-Programs disagree about the axes of an .spz: RUB by its specification (x right,
-y up, z backward), those of the PLY, RDF, in others. --axes names them: of the
-.spz that is read, or of the one that is written if none is read.
+--axes is that of the .spz that is read, or written if none is: RUB by its
+specification, RDF (those of the PLY) in some programs.
 
 If a run has not ended, its newest whole checkpoint is converted.
 
@@ -65,10 +64,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--extension", metavar="E", help="extension that draws a file; core is 3DGS (default: what the file names)"
     )
-    parser.add_argument(
-        "--drop-outliers", action="store_true", help="leave out Gaussians that are far from all others, or far larger"
-    )
-    parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
+    parser.add_argument("--drop-outliers", action="store_true", help="leave out what is far from all others")
+    parser.add_argument("--axes", metavar="A", help="of an .spz (default: what it names, or RUB)")
     parser.set_defaults(run=run)
 
 

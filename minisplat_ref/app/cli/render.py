@@ -34,12 +34,9 @@ Cameras, by --cameras:
   test, train, all   those of the run (default test)
   orbit              along the training cameras, there and back unless they
                      stand all around; a circle around a PLY (its default)
-  FILE.json          list of cameras, as in the cameras.json of 3DGS: img_name,
-                     width, height, position, rotation (world_from_camera),
-                     fx, fy and, if the principal point is off centre, cx, cy;
-                     nerfstudio's camera_path.json, a transforms.json,
-                     SuperSplat's poses, instant-ngp's base_cam.json
-  FOLDER             a COLMAP model, or a scene that has one
+  FILE.json          cameras.json of 3DGS (docs/GUIDE.md), camera_path.json,
+                     transforms.json, SuperSplat's poses, base_cam.json
+  FOLDER             of a COLMAP model
 """
 EPILOG = """\
 examples:
@@ -77,8 +74,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--environment", type=Path, metavar="FILE", help="other light by latitude and longitude: image or .npy"
     )
-    parser.add_argument("--extension", metavar="E", help="draws a file; core is 3DGS (default: what it names)")
-    parser.add_argument("--axes", metavar="A", help="of an .spz, such as RUB, RDF (default: what it names, or RUB)")
+    parser.add_argument("--extension", metavar="E", help="draws a file; core is 3DGS; --axes A: of an .spz")
+    parser.add_argument("--axes", metavar="A", help=argparse.SUPPRESS)
     parser.add_argument(
         "--frames", type=integer(1), default=60, metavar="N", help="number of images of an orbit (default 60)"
     )
@@ -87,7 +84,7 @@ def add_parser(commands: Commands) -> None:
         "--size",
         type=_size,
         metavar="WxH",
-        help="of images whose cameras have none (default: the run's, or 640x480)",
+        help="where cameras have none (default: the run's, or 640x480)",
     )
     parser.add_argument(
         "--film", type=Path, metavar="FILE", help="also a film: .gif, .mp4 (imageio[ffmpeg]); --fps F (25)"
