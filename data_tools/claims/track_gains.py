@@ -41,7 +41,7 @@ N_ROUNDS = 40  # of alternating least squares and weights
 RIDGE = 1e-6  # of the number of observations: an effect that a photograph does not show is 0
 MIDDLE = -1.0  # log colour that a response leaves as it is
 PLANTED = (0.0, 0.03, 0.05, 0.1)  # standard deviations of log gains
-SYNTHETIC = {"n_views": 20, "width": 160, "height": 120, "n_points": 3000}
+SYNTHETIC: dict[str, Any] = {"n_views": 20, "width": 160, "height": 120, "n_points": 3000}
 COLORS = (GREY, BLUE, OCHRE, GREEN, PURPLE, RED)
 
 
@@ -104,7 +104,8 @@ def fit_effect(effect: str, tracks: Tracks, n_views: int, n_points: int) -> tupl
     Alternating weighted least squares, with the Cauchy weights of :mod:`minisplat_ref.strategy.track_gains`. The mean
     of each coefficient that a photograph has of its own is 0.
     """
-    weights, colors = np.ones(len(tracks.view)), _means(tracks, tracks.log_color, np.ones(len(tracks.view)), n_points)
+    weights: Floats = np.ones(len(tracks.view))
+    colors = _means(tracks, tracks.log_color, weights, n_points)
     coefficients = np.zeros((n_views, 1))
     for _ in range(N_ROUNDS):
         columns, is_shared = columns_of(effect, tracks, colors)
