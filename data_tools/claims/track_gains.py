@@ -110,7 +110,7 @@ def fit_effect(effect: str, tracks: Tracks, n_views: int, n_points: int) -> tupl
     for _ in range(N_ROUNDS):
         columns, is_shared = columns_of(effect, tracks, colors)
         rest = tracks.log_color - colors[tracks.point]
-        common = np.zeros(columns.shape[1])
+        common: Floats = np.zeros(columns.shape[1])
         if is_shared:
             centred = columns - np.stack(
                 [_means(tracks, c, weights, n_points)[tracks.point] for c in columns.T], axis=1
