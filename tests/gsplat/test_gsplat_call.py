@@ -357,6 +357,22 @@ def test_tiles_of_the_meta(size, rng):
         rasterization(**call, tile_size=0)
 
 
+def test_arguments_by_position_are_those_of_gsplat(rng):
+    """In gsplat's order: planes, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode."""
+    call = make_call(rng)
+    del call["sh_degree"]
+    backgrounds = np.full((2, 3), 0.25)
+    by_name = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 1.0, "eps2d": 0.2, "sh_degree": None}
+    by_name |= {"packed": True, "tile_size": 8, "backgrounds": backgrounds, "render_mode": "RGB+D"}
+    (colors, alphas, meta), (others, other_alphas, other_meta) = (
+        rasterization(**call, **by_name),
+        rasterization(*call.values(), *by_name.values()),  # in the order of make_call
+    )
+    assert_array_equal(colors, others)
+    assert_array_equal(alphas, other_alphas)
+    assert meta["tile_width"] == other_meta["tile_width"] and len(meta["depths"]) == len(other_meta["depths"])
+
+
 @pytest.mark.parametrize("mode", ["D", "ED"])
 def test_depth_needs_no_colors(mode, rng):
     call = make_call(rng) | {"render_mode": mode}

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning
+from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import (
     composite_alpha,
     downscaled_size,
@@ -15,6 +16,7 @@ from minisplat_ref.io.images import (
     resize_mask,
     write_image,
 )
+from photo_scenes import HEIGHT, WIDTH, write_colmap
 
 
 @pytest.fixture
@@ -141,3 +143,16 @@ def test_nothing_bad_is_written(tmp_path):
     with pytest.raises(InputError, match=r"the folder .*nowhere does not exist"):
         write_image(tmp_path / "nowhere" / "a.png", np.zeros((2, 2)))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_test_view_whose_mask_is_empty_is_set_aside(index, tmp_path):
+    """The first of two as the second; training views stay as they are."""
+    scene = write_colmap(tmp_path, n=6)
+    names = ("0000", "0003")
+    (scene / "masks").mkdir()
+    write_image(scene / "masks" / f"{names[index]}.png", np.zeros((HEIGHT, WIDTH), bool))
+    with pytest.warns(InputWarning, match="the masks of 1 of 6 views leave no pixel"):
+        loaded = load_scene(scene, test_every=3)
+    assert [view.name for view in loaded.test_views] == [names[1 - index]]
+    assert [view.name for view in loaded.train_views] == ["0001", "0002", "0004", "0005"]

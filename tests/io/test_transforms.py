@@ -11,6 +11,7 @@ from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io import load_scene, load_transforms
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import write_vertices
+from minisplat_ref.io.transforms import find_frames, read_transforms
 from photo_scenes import HEIGHT, WIDTH, colored_image, edit_transforms, sparse_color_errors, write_transforms
 from tolerances import CLOSED_FORM, COLOR_RATIO, FOX_CENTERS, FOX_ROTATIONS, SAME_CAMERAS
 
@@ -347,3 +348,27 @@ def test_not_json(tmp_path):
 def test_no_file(tmp_path):
     with pytest.raises(InputError, match=r"no transforms_train\.json or transforms\.json; give the folder"):
         load_transforms(tmp_path)
+
+
+# lenses
+
+
+def lens_of(folder, **entries):
+    """The lens of the first frame of a file with these entries."""
+    write_transforms(folder, fl_x=40.0, fl_y=42.0, cx=15.0, cy=12.0, **entries)
+    (_, photo), *_ = find_frames(folder / "transforms.json", read_transforms(folder / "transforms.json"))
+    return photo.lens
+
+
+PINHOLE_OF_LENSES = (40.0, 42.0, 15.0, 12.0)
+
+
+def test_coefficients_are_in_the_order_of_colmap(tmp_path):
+    """k1, k2, p1, p2, then k3; of a fisheye k1 to k4."""
+    given = {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}
+    assert lens_of(tmp_path / "a", **given) == ("OPENCV", (*PINHOLE_OF_LENSES, 0.1, 0.2, 0.3, 0.4))
+    full = lens_of(tmp_path / "b", **given, k3=0.5)
+    assert full == ("FULL_OPENCV", (*PINHOLE_OF_LENSES, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0))
+    fisheye = lens_of(tmp_path / "c", k1=0.1, k2=0.2, k3=0.3, k4=0.4, camera_model="opencv_fisheye")
+    assert fisheye == ("OPENCV_FISHEYE", (*PINHOLE_OF_LENSES, 0.1, 0.2, 0.3, 0.4))
+    assert lens_of(tmp_path / "d", camera_model="Pinhole") is None

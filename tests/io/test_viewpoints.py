@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from minisplat_ref.errors import InputError
 from minisplat_ref.io.orbits import orbit
 from minisplat_ref.io.viewpoints import Viewpoint, read, to_json
 from rings import HEIGHT, WIDTH, ring_of_cameras
@@ -87,3 +88,14 @@ def test_orbit_of_one_point_and_of_none():
     for means in (np.zeros((0, 3)), np.ones((1, 3))):
         (frame,) = orbit(means, [], 1, WIDTH, HEIGHT)
         assert np.isfinite(frame.camera.cam_from_world_R).all() and np.isfinite(frame.camera.cam_from_world_t).all()
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_mirrored_camera_is_refused(axis, tmp_path):
+    """A matrix of determinant -1 is orthogonal, and no rotation."""
+    mirrored = np.eye(3)
+    mirrored[axis, axis] = -1
+    entry = {"img_name": "a", "width": 8, "height": 6, "fx": 9, "fy": 10, "position": [0, 0, 0]}
+    (tmp_path / "c.json").write_text(json.dumps([{**entry, "rotation": mirrored.tolist()}]))
+    with pytest.raises(InputError, match="camera 0: rotation is not a rotation matrix"):
+        read(tmp_path / "c.json")
