@@ -47,6 +47,7 @@ from minisplat_ref.methods.adaptive.numbers import RAISED
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.training.calibration import NONE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates, n_coefficients, present_degrees
 from minisplat_ref.training.recipe_settings import configure, match_calibrations, settings_of
@@ -128,7 +129,7 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "no cut of bands": lambda recipe: configure(recipe, min_variation=0.0),
     "no sky": lambda recipe: configure(recipe, min_sky_gain=math.inf),
     "no prune": lambda recipe: configure(recipe, min_slope=0.0, min_views=0),
-    "no exposures": lambda recipe: configure(recipe, min_exposure_gain=math.inf),
+    "no exposures": lambda recipe: configure(recipe, exposure=NONE),
     "no poses": lambda recipe: configure(recipe, min_pose_gain=math.inf),
     "no anti-aliasing": lambda recipe: configure(recipe, min_antialiasing_gain=math.inf),
 }

@@ -1,8 +1,8 @@
 """Planted defects: whether ``adaptive`` finds them, and none where there are none.
 
 The claim is ours. Photographs of a scene are disturbed in a known way, differently in every trial, and the scene is
-trained until the iteration in which ``adaptive`` has decided about a sky, exposures, poses and anti-aliasing. A trial
-records what was switched on. Its seed is used for the disturbance and the training.
+trained until the iteration in which ``adaptive`` has decided about exposures (before the first one), a sky,
+anti-aliasing and poses. A trial records what was switched on. Its seed is used for the disturbance and the training.
 
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have other defects
@@ -43,6 +43,7 @@ from minisplat_ref.types import Bools, Floats, Scene, View
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
 COLORS = {"sky": GREEN, "exposure": BLUE, "pose": RED, "antialiasing": OCHRE}
+"""By the name of each calibration that can be asked about."""
 HEIGHT = 0.2  # of a bar
 CUT = 1.2  # metres
 
@@ -139,9 +140,9 @@ def run(args: argparse.Namespace) -> kit.Report:
     unknown = [name for name in args.conditions if name not in CONDITIONS]
     if unknown:
         raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
-    unasked = [name for name in args.asked if name not in SWITCHES]
+    unasked = [name for name in args.asked if name not in COLORS]
     if unasked:
-        raise InputError(f"{unasked[0]!r} is nothing that adaptive switches on: choose from {', '.join(SWITCHES)}")
+        raise InputError(f"{unasked[0]!r} is nothing that adaptive switches on: choose from {', '.join(COLORS)}")
     scene = kit.read_scene(args.scene, args.downscale, is_tested=False)
     description = kit.describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "asked": list(args.asked)}
@@ -155,13 +156,14 @@ def run(args: argparse.Namespace) -> kit.Report:
     summary = summarise(records, args.asked)
     result = {**description, **settings, "trials": args.trials, "summary": summary, "runs": records}
     heading = ["photographs", "trials", *(f"{name} switched on" for name in args.asked)]
-    text = f"{kit.title(description)}\nafter {decision_step(args.asked)} iterations of adaptive\n\n"
+    n = decision_step(args.asked)
+    text = f"{kit.title(description)}\nafter {n} iteration{'s'[: n > 1]} of adaptive\n\n"
     return kit.Report(result, draw(summary, args.asked), text + markdown_table(heading, to_rows(summary)))
 
 
 def decision_step(asked: Sequence[str]) -> int:
-    """Return the iteration after which it has been decided about all that is asked."""
-    return max(firing_steps(ADAPTIVE, *(SWITCHES[name] for name in asked)))
+    """Return the iteration after which it has been decided about all that is asked; exposures do not need one."""
+    return max([1, *firing_steps(ADAPTIVE, *(SWITCHES[name] for name in asked if name in SWITCHES))])
 
 
 def decide(scene: Scene, seed: int, asked: Sequence[str]) -> dict[str, Any]:
@@ -173,6 +175,7 @@ def decide(scene: Scene, seed: int, asked: Sequence[str]) -> dict[str, Any]:
     def on_step(report: StepReport) -> None:
         nonlocal switched_on
         notes.update({fired.action: fired.note for fired in report.fired if "switch" in fired.action})
+        notes.update({first.what: first.why for first in report.state.pace.decisions if first.step == 0})
         switched_on = report.state.pace.switched_on
         if report.step == last:
             raise _DecidedError
@@ -228,7 +231,7 @@ CLAIMS = (
         argument(
             "--asked",
             type=NAMES,
-            default=("sky", "exposure", "pose", "antialiasing"),
+            default=tuple(COLORS),
             metavar="A,B",
             help="train until it is decided about these alone (default: all: sky,exposure,pose,antialiasing)",
         ),

@@ -10,13 +10,10 @@ from adaptive_states import iteration_of, state_of
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.scene import half_size
-from minisplat_ref.methods.adaptive import exposure
-from minisplat_ref.methods.adaptive.evidence import Evidence
 from minisplat_ref.methods.adaptive.numbers import GAIN_MIN
-from minisplat_ref.methods.adaptive.switches import switch_antialiasing_on, switch_exposure_on
+from minisplat_ref.methods.adaptive.switches import switch_antialiasing_on
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.rendering.backends import CPU
-from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation
 from minisplat_ref.training.pace import Pace
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
@@ -118,20 +115,6 @@ def test_two_sizes_ask_for_it(truth):
     assert state.pace.decisions[0].gain > GAIN_MIN
     again = switch_antialiasing_on(state, iteration_of(scene), min_antialiasing_gain=GAIN_MIN)
     assert again == "nothing done: opacities are compensated"
-
-
-@pytest.mark.parametrize(
-    ("gain", "min_antialiasing_gain", "are_on"),
-    [(0.2, GAIN_MIN, False), (0.2, np.inf, True), (20.0, GAIN_MIN, True)],
-)
-def test_of_gains_and_compensation_what_explains_more(gain, min_antialiasing_gain, are_on, truth, monkeypatch):
-    found = Evidence(gain, 0.01, np.zeros((N_VIEWS, 1)))
-    monkeypatch.setattr(exposure, "exposure_evidence", lambda *_: found)
-    least = {"min_exposure_gain": GAIN_MIN, "min_antialiasing_gain": min_antialiasing_gain}
-    scene = scene_of(truth, has_two_sizes=True)
-    state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
-    note = switch_exposure_on(state, iteration_of(scene), **least)
-    assert ("compensated" not in note) == (EXPOSURES in state.shared) == are_on
 
 
 def test_one_size_does_not(truth):

@@ -17,8 +17,10 @@ the work, in pairs (tile, Gaussian), is the slope of a line through the measurem
 at twice the size; when they are as they were taken, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
 
-*Calibrate.* A sky, exposures, refined poses and compensated opacities are each switched on once, and only if parameters
-fitted to one half of the photographs, or of each photograph, improve the other half.
+*Calibrate.* Where the tracks of the sparse points show that photographs differ in their exposure, each has its own from
+the first iteration on (:mod:`minisplat_ref.strategy.track_gains`). A sky, compensated opacities and refined poses are
+each switched on once, and only if parameters fitted to one half of the photographs, or of each photograph, improve the
+other half.
 
 *Begin densely.* Stereo adds surface points where structure from motion has found few
 (:mod:`minisplat_ref.training.dense_start`).
@@ -36,7 +38,6 @@ those beside a camera, nearer than what is known around it.
 ``progress``      the gain of the held-out views, and its consequence: larger views, or the end
 ``switches``      calibrations that are switched on if the photographs need them: the rule, and the table
 ``evidence``      parameters that are fitted to one half of each photograph and judged on the other
-``exposure``      the exposure of each photograph
 ``pose``          the pose of each photograph
 ``antialiasing``  compensated opacities, where photographs differ in resolution
 ``sky``           a sky behind the scene

@@ -3,12 +3,12 @@
 After a few hundred iterations a scene is a blur in the right place. To first order, a calibration explains the residual
 r = photograph - rendering by a few fields b_k, ``r = sum_k x_k b_k``:
 
-* a gain g of the exposure by ``x = g - 1`` and the rendering itself, b = rendering;
 * a displacement (dx, dy) in pixels, the main effect of a wrong pose, by ``x = -(dx, dy)`` and the slopes of the
-  rendering, b = (d/du, d/dv) rendering.
+  rendering, b = (d/du, d/dv) rendering;
+* an amount x of compensation of the opacities, and its effect, b = compensated rendering - rendering.
 
 The x of a photograph are fitted to its left half by least squares and judged on its right half, and vice versa. Noise
-and the remaining errors of the scene differ from half to half, and worsen the other half; an exposure and a pose are
+and the remaining errors of the scene differ from half to half, and worsen the other half; a pose and a resolution are
 the same in both, and improve it. The x that explains all photographs together best belongs to the scene and not to
 them; the comparison starts from it:
 
@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive.numbers import BRIGHT, DARK, N_ERRORS, RIDGE
+from minisplat_ref.methods.adaptive.numbers import N_ERRORS, RIDGE
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats, View
@@ -158,16 +158,6 @@ def pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> I
 def render_clipped(state: TrainState, iteration: Iteration, view: View, request: Request) -> Floats:
     """Return the scene as it is, [H, W, 3] in [0, 1]."""
     return np.clip(iteration.render_settings.renderer.render(state.model, view, request)[0].image, 0.0, 1.0)
-
-
-def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
-    """Return the training views' evidence for individual gains."""
-    photographs = []
-    for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
-        seen, there = rendered.mean(axis=2), photograph.mean(axis=2)
-        is_usable = is_counted & (seen > DARK) & (there > DARK) & (there < BRIGHT)
-        photographs.append(split_halves(photograph - rendered, rendered[None], is_usable))
-    return weigh(photographs)
 
 
 def pose_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:

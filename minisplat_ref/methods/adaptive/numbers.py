@@ -70,23 +70,19 @@ COOLING_LAST, COOLING_LAST_PER_EXTENT = 0.1, 0.01
 SKY_STEP = 100
 """Iteration in which a sky is considered. No reason recorded for 100; large Gaussians have covered it by then
 (H)."""
-EXPOSURE_STEP = 600
-"""Iteration in which exposures are considered: after a few hundred, the scene is a blur of the right brightness."""
 ANTIALIASING_STEP = 650
-"""Iteration in which anti-aliasing is considered, before poses: in the other order, poses were wrongly on in half of
-the trials with two sizes on the room (D)."""
+"""Iteration in which anti-aliasing is considered: after a few hundred, the scene is a blur in the right place. It comes
+before poses, which in the other order were wrongly on in half of the trials with two sizes on the room (D)."""
 POSE_STEP = 700
 """Iteration in which poses are considered, after anti-aliasing."""
 GAIN_MIN = 0.1
-"""dB of the squared error for which a calibration is worthwhile. With 0.05 dB exposures came on in some trials of
-brighton_beach, and cost 1.2 dB (D)."""
+"""dB of the squared error for which a calibration is worthwhile. With 0.05 dB exposures, which were once judged by it,
+too, came on in some trials of brighton_beach, and cost 1.2 dB (D)."""
 N_ERRORS = 1.0
 """Standard errors that the gain of a calibration must exceed. With two, one of ten planted gains was found on banana,
 where eleven photographs provide the evidence (D)."""
 RIDGE = 1e-3
 """Of the mean square of a field over the halves: where next to nothing is rendered, x would be arbitrary."""
-DARK, BRIGHT = 0.05, 0.98
-"""Brightness, out of 1, beyond which pixels carry no information about a gain: noise, saturation."""
 
 # --- a sky ---
 

@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive.exposure import log_gains
 from minisplat_ref.methods.adaptive.numbers import MEASUREMENTS_MIN
 from minisplat_ref.metrics import psnr, ssim
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.pace import COOLED, FINER, Cooling, Decision, Measurement, held_out_ids
 from minisplat_ref.training.state import Iteration, TrainState, begin_cooling
 
@@ -26,12 +24,10 @@ def evaluate_held_out(
     """Return the PSNR of the held-out training views, and the SSIM on request."""
     views = iteration.scene.train_views
     ids, psnrs, ssims = held_out_ids(len(views), cooling.hold_out_every), [], []
-    # Their exposures are not trained and must not enter the measurement. For poses, see turn_held_out.
-    gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
-    for index, gain in zip(ids, gains.astype(np.float32), strict=True):
+    for index in ids:  # each has its own exposure, if there are any, and the pose that turn_held_out gives it
         view = views[index].load()
         output, _ = iteration.render_settings.render_view(state.model, view)
-        image = np.clip(gain * output.image, 0.0, 1.0)
+        image = np.clip(output.image, 0.0, 1.0)
         psnrs.append(psnr(image, view.image, view.mask))
         if has_ssim:
             ssims.append(ssim(image, view.image, view.mask))

@@ -19,14 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.methods.adaptive.exposure import begin_exposures
 from minisplat_ref.methods.adaptive.numbers import COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
 from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.strategy.removal import collect_removal_costs, select_worthwhile
-from minisplat_ref.training.pace import Decision, Measurement, Pace, trained_ids
+from minisplat_ref.training.pace import Decision, Measurement, Pace
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 
 
@@ -72,7 +71,7 @@ def prune_in_slices(
     number = slice_due(state.pace, iteration.step)
     if number is None:
         if is_prune_done(state.pace, iteration.step):
-            take_all_views(state, iteration)
+            take_all_views(state)
         return
     iteration.fetch()
     now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
@@ -85,7 +84,7 @@ def prune_in_slices(
             f" {max_ssim_cost:g} are allowed"
         )
         state.pace = state.pace.with_decision(Decision(iteration.step, "prune ended", why, None, None))
-        take_all_views(state, iteration)
+        take_all_views(state)
         return
     if number == 0:
         prune_seen_by_few(state, iteration, min_views)
@@ -140,11 +139,8 @@ def _foresee(before_slices: Sequence[Sequence[float]]) -> Cost:
     return Cost(float(lost.mean()), float(lost.std(ddof=1) / np.sqrt(len(lost))))
 
 
-def take_all_views(state: TrainState, iteration: Iteration) -> None:
+def take_all_views(state: TrainState) -> None:
     """End the prune: from the next iteration on, all training views are trained on."""
-    n_views = len(iteration.scene.train_views)
-    held_out = set(range(n_views)) - set(trained_ids(n_views, iteration.cooling, state.pace))
-    begin_exposures(state, iteration, sorted(held_out))
     state.pace = state.pace._replace(is_pruning=False)
     state.view_order = []
 

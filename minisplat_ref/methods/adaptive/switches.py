@@ -2,7 +2,8 @@
 
 Each calibration (:mod:`minisplat_ref.training.calibration`) is examined once, in one iteration. It is switched on if
 the photographs' gain by it is above a minimum gain and above a number of standard errors
-(:mod:`minisplat_ref.methods.adaptive.evidence`), unless a rival explains more.
+(:mod:`minisplat_ref.methods.adaptive.evidence`). Exposures are not among them: the tracks of the sparse points show
+those before the first iteration (:mod:`minisplat_ref.strategy.track_gains`).
 """
 
 from collections.abc import Callable, Mapping
@@ -10,12 +11,11 @@ from dataclasses import dataclass
 
 from minisplat_ref.methods.adaptive.antialiasing import examine_antialiasing
 from minisplat_ref.methods.adaptive.evidence import Answer
-from minisplat_ref.methods.adaptive.exposure import examine_exposures
 from minisplat_ref.methods.adaptive.numbers import N_ERRORS, SKY_N_ERRORS
 from minisplat_ref.methods.adaptive.pose import examine_poses
 from minisplat_ref.methods.adaptive.sky import examine_sky
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, EXPOSURE, POSE, Calibration
+from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, POSE, Calibration
 from minisplat_ref.training.pace import Decision
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats
@@ -34,45 +34,37 @@ class Switch:
     """Examines the photographs; returns the reason where there is nothing to examine."""
     n_errors: float = N_ERRORS
     """Standard errors that the gain must exceed."""
-    rival: "Switch | None" = None
-    """It is the rival that the photographs need if they gain more by it."""
 
     @property
     def __name__(self) -> str:
         """Name of the action in records and descriptions."""
         return f"switch_{self.calibration.name}_on"
 
-    def __call__(self, state: TrainState, iteration: Iteration, **min_gains: float) -> str | None:
+    def __call__(self, state: TrainState, iteration: Iteration, **min_gain: float) -> str:
         """Switch the calibration on, or report the reason against it.
 
         Parameters
         ----------
         state, iteration
             As for every action.
-        **min_gains
-            ``min_NAME_gain`` of this calibration and of its rival: dB of the squared error that the photographs must
-            gain on average.
+        **min_gain
+            ``min_NAME_gain`` of this calibration: dB of the squared error that the photographs must gain on average.
         """
-        answer = self._supported(state, iteration, min_gains)
+        answer = self._supported(state, iteration, min_gain[f"min_{self.calibration.name}_gain"])
         if isinstance(answer, str):
             return f"nothing done: {answer}"
-        if self.rival is not None:
-            other = self.rival._supported(state, iteration, min_gains)
-            if isinstance(other, Answer) and other.evidence.gain > answer.evidence.gain:
-                return f"nothing done: {answer.why}, but {other.why}"
         evidence = answer.evidence
         decision = Decision(iteration.step, self.decision, answer.why, evidence.gain, evidence.standard_error)
         add_calibration(state, self.calibration, answer.begin(), decision)
         return answer.why
 
-    def _supported(self, state: TrainState, iteration: Iteration, min_gains: Mapping[str, float]) -> Answer | str:
+    def _supported(self, state: TrainState, iteration: Iteration, min_gain: float) -> Answer | str:
         """Return the photographs' evidence if it supports the calibration, and otherwise the reason against it."""
         if self.calibration.initial(1).keys() <= state.shared.keys():
             return self.already
         answer = self.examine(state, iteration)
         if isinstance(answer, str):
             return answer
-        min_gain = min_gains[f"min_{self.calibration.name}_gain"]
         if answer.evidence.is_above(min_gain, self.n_errors):
             return answer
         return f"{answer.why}; it takes {min_gain:g} dB and {self.n_errors:g} standard error{'s'[: self.n_errors > 1]}"
@@ -106,11 +98,7 @@ def add_calibration(
 
 switch_sky_on = Switch(BACKDROP, "sky", "there is a sky", examine_sky, SKY_N_ERRORS)
 switch_antialiasing_on = Switch(ANTIALIASING, "anti-aliasing", "opacities are compensated", examine_antialiasing)
-switch_exposure_on = Switch(EXPOSURE, "exposures", "exposures are on", examine_exposures, rival=switch_antialiasing_on)
 switch_pose_on = Switch(POSE, "poses", "poses are refined", examine_poses)
 
-SWITCHES = {
-    switch.calibration.name: switch
-    for switch in (switch_sky_on, switch_exposure_on, switch_antialiasing_on, switch_pose_on)
-}
+SWITCHES = {switch.calibration.name: switch for switch in (switch_sky_on, switch_antialiasing_on, switch_pose_on)}
 """By the name of the calibration, in the order in which they are examined."""

@@ -50,7 +50,7 @@ def test_each_rule_is_taken_out():
     assert settings_of(recipes["no prune"])["min_slope"] == 0.0
     assert settings_of(recipes["largest gradients first"])["error_views"] == 0
     assert settings_of(recipes["no sky"])["min_sky_gain"] == np.inf
-    assert settings_of(recipes["no exposures"])["min_exposure_gain"] == np.inf
+    assert settings_of(recipes["no exposures"])["exposure"] == "none" != settings_of(ADAPTIVE)["exposure"]
     assert settings_of(recipes["no poses"])["min_pose_gain"] == np.inf
     for recipe in recipes.values():
         assert recipe.cooling.hold_out_every == ADAPTIVE.cooling.hold_out_every

@@ -49,11 +49,34 @@ def test_command(tmp_path, capsys):
     assert [run["condition"] for run in result["runs"]] == ["clean", "gains", "poses", "sizes"]
     for run in result["runs"]:
         row = result["summary"][run["condition"]]
-        assert row == {"trials": 1, **{what: int(what in run["switched_on"]) for what in defects.SWITCHES}}
+        assert row == {"trials": 1, **{what: int(what in run["switched_on"]) for what in defects.COLORS}}
         del run["evidence"]["switch_sky_on"]
-        assert all("fitted to" in note for note in run["evidence"].values()) and len(run["evidence"]) == 3
+        assert all("fitted to" in note for note in run["evidence"].values()) and len(run["evidence"]) == 2
     printed = capsys.readouterr().out
-    assert f"after {defects.decision_step(list(defects.SWITCHES))} iterations" in printed and "| poses " in printed
+    assert f"after {defects.decision_step(list(defects.COLORS))} iterations" in printed and "| poses " in printed
+
+
+def test_gains_are_found_by_tracks_before_the_first_iteration(tmp_path, capsys):
+    """In photographs of 64 x 48 with a thousand points; a scene without tracks says nothing about them."""
+    options = ["--views", "9", "--width", "64", "--height", "48", "--supersampling", "1", "--points", "1000"]
+    assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *options]) == 0
+    command = ["defects", str(tmp_path / "room"), "--asked", "exposure", "--conditions", "clean,gains", "--trials", "2"]
+    result = measured([*command, "--out", str(tmp_path / "out")])
+    assert {name: row.get("exposure") for name, row in result["summary"].items() if row["trials"]} == {
+        "clean": 0,
+        "gains": 2,
+    }
+    for run in result["runs"]:
+        is_planted = run["condition"] == "gains"
+        assert run["switched_on"] == ["exposure"] * is_planted and list(run["evidence"]) == ["exposures"] * is_planted
+    assert "after 1 iteration of adaptive" in capsys.readouterr().out
+    tracked = make_scene("room", n_views=9, width=64, height=48, n_points=1000, supersampling=1).scene
+    views = tuple(view._replace(point_ids=None) for view in tracked.train_views)
+    found = {}
+    for name, each in (("tracks", tracked), ("no tracks", tracked._replace(train_views=views))):
+        disturbed = defects.with_gains(each, np.random.default_rng(0))
+        found[name] = defects.decide(disturbed, 0, ["exposure"])["switched_on"]
+    assert found == {"tracks": ["exposure"], "no tracks": []}
 
 
 def test_sky_is_planted_above_the_cut():

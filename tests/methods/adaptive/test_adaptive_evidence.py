@@ -1,4 +1,4 @@
-"""What halves of photographs say about gains and displacements, and poses that ``adaptive`` refines by it."""
+"""What halves of photographs say about displacements, and poses that ``adaptive`` refines by it."""
 
 import numpy as np
 import pytest
@@ -38,8 +38,8 @@ def test_half_by_hand():
 
 def test_evidence_is_told_in_words():
     found = Evidence(0.731, 0.1, np.zeros((3, 1)))
-    assert found.describe("exposures that differ by 4.3%") == (
-        "exposures that differ by 4.3%, fitted to one half of each photograph, improve the other half by 0.73 ± 0.10 dB"
+    assert found.describe("cameras turned by 0.43 pixels") == (
+        "cameras turned by 0.43 pixels, fitted to one half of each photograph, improve the other half by 0.73 ± 0.10 dB"
     )
     worse = found._replace(gain=-0.03).describe("a sky in place of 9 large Gaussians", "half of them", "the others")
     assert worse == "a sky in place of 9 large Gaussians, fitted to half of them, worsens the others by 0.03 ± 0.10 dB"

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.methods.adaptive import evidence
-from minisplat_ref.methods.adaptive.evidence import Evidence, Half, exposure_evidence, pairs, split_halves, weigh
+from minisplat_ref.methods.adaptive.evidence import Evidence, Half, pairs, split_halves, weigh
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import View
 from scenes import make_camera
@@ -90,41 +89,6 @@ def setting(rendered, photograph, mask=None):
     return SimpleNamespace(model=None), SimpleNamespace(
         scene=SimpleNamespace(train_views=[view]), render_settings=settings
     )
-
-
-@pytest.mark.parametrize(
-    ("rendered", "photograph", "counts"),
-    [
-        ([0.049] * 3, [128] * 3, False),
-        ([0.051] * 3, [128] * 3, True),
-        ([0.0, 0.0, 0.156], [128] * 3, True),  # 0.052 on the mean
-        ([0.06, 0.06, 0.0], [128] * 3, False),  # 0.04
-        ([1.0] * 3, [128] * 3, True),  # a rendering may be bright
-        ([0.5] * 3, [12] * 3, False),  # 0.047
-        ([0.5] * 3, [13] * 3, True),  # 0.051
-        ([0.5] * 3, [249] * 3, True),  # 0.976
-        ([0.5] * 3, [250] * 3, False),  # 0.9804
-        ([0.5] * 3, [255, 255, 230], True),  # 0.967
-    ],
-)
-def test_dark_and_saturated_pixels_say_nothing_about_gains(monkeypatch, rendered, photograph, counts):
-    """From 0.05 to 0.98 of brightness; one pixel in each half."""
-    monkeypatch.setattr(evidence, "weigh", lambda halves: halves)
-    state, iteration = setting([[rendered] * 2], [[photograph] * 2])
-    (both,) = exposure_evidence(state, iteration, [0])
-    r = np.array(photograph) / 255 - rendered
-    for found in both:
-        assert_allclose(found.normal[0, 0], np.dot(rendered, rendered) if counts else 0, rtol=1e-6)
-        assert_allclose(found.energy, r @ r if counts else 0, rtol=1e-5, atol=1e-12)
-
-
-def test_masked_pixels_say_nothing_about_gains(monkeypatch):
-    """One pixel of two in the left half, none in the right: three times 0.5 squared."""
-    monkeypatch.setattr(evidence, "weigh", lambda halves: halves)
-    mask = np.array([[True, False], [False, False]])
-    state, iteration = setting(np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 128), mask)
-    ((left, right),) = exposure_evidence(state, iteration, [0])
-    assert_allclose([left.normal[0, 0], right.normal[0, 0]], [0.75, 0])
 
 
 def test_renderings_are_compared_as_they_are_shown():

@@ -1,120 +1,41 @@
-"""Exposures that ``adaptive`` switches on where the photographs need them, and where they do not, leaves off."""
+"""``adaptive`` gives photographs the exposures that tracks show, before the first iteration, held-out ones too."""
+
+import json
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from adaptive_states import iteration_of, state_of
+from minisplat_ref.app.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
-from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure, log_gains
-from minisplat_ref.methods.adaptive.prune import take_all_views
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
-from minisplat_ref.methods.adaptive.switches import switch_exposure_on
-from minisplat_ref.rendering import render
-from minisplat_ref.rendering.backends import CPU
-from minisplat_ref.training.calibration import EXPOSURES
+from minisplat_ref.training.calibration import EXPOSURES, LEARNED, NONE
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import At, Every
-from minisplat_ref.types import Scene, View
-from scenes import as_dtype, make_camera, make_gaussians
 
-GAINS = np.array([0.7, 1.2, 1.0, 0.8, 1.1, 0.9, 1.3, 1.0])
-ROUNDED = 0.01  # of a brightness: photographs are bytes, here of 13 to 250
-BACKGROUND = np.array([0.3, 0.3, 0.3])
-
-
-def scene_of(truth, gains):
-    rng = np.random.default_rng(1)
-    views = []
-    for i, gain in enumerate(gains):
-        camera = make_camera(24, 16, rng=rng)
-        image = render(truth, camera, background=BACKGROUND, backend=CPU)[0].image
-        pixels = np.round(255 * np.clip(gain * np.clip(image, 0, 1), 0, 1)).astype(np.uint8)
-        views.append(View(f"view{i}", camera, pixels, None, view_id=i))
-    colors = np.full((len(truth.means), 3), 128, np.uint8)
-    return Scene("tiny", tuple(views), (), truth.means.astype(float), colors, BACKGROUND, 1.0)
+SETTINGS = {"n_views": 12, "width": 64, "height": 48, "n_points": 1000}
+GAINS = np.array([0.7, 1.2, 1.0, 0.8, 1.1, 0.9, 1.3, 1.0, 0.75, 1.25, 0.95, 1.05])
+DARKER = 0.7  # factor of all photographs, so that nothing is clipped
+IDENTITY = np.eye(3, 4)
 
 
-@pytest.fixture(scope="module")
-def truth():
-    gaussians = as_dtype(make_gaussians(np.random.default_rng(5), 30), np.float32)
-    return gaussians._replace(sh_dc=np.clip(gaussians.sh_dc, -0.6, 0.4), sh_rest=0 * gaussians.sh_rest)
-
-
-@pytest.fixture
-def disturbed(truth):
-    return scene_of(truth, GAINS)
-
-
-def test_gains_are_read_off(disturbed, truth):
-    gains = log_gains(state_of(disturbed, truth), iteration_of(disturbed), range(8))
-    assert_allclose(gains, np.log(GAINS), atol=ROUNDED)
-
-
-def test_pixels_outside_the_mask_say_nothing(disturbed, truth):
-    first = disturbed.train_views[0]
-    image = first.image.copy()
-    image[:8] = 200
-    mask = np.ones(image.shape[:2], bool)
-    mask[:8] = False
-    views = (first._replace(image=image, mask=mask), *disturbed.train_views[1:])
-    masked = disturbed._replace(train_views=views)
-    assert_allclose(log_gains(state_of(masked, truth), iteration_of(masked), [0]), np.log(0.7), atol=ROUNDED)
-    black = disturbed._replace(train_views=(first._replace(image=0 * image), *disturbed.train_views[1:]))
-    assert_array_equal(log_gains(state_of(black, truth), iteration_of(black), [0]), [0.0])
-
-
-def test_equal_exposures_switch_nothing_on(truth):
-    scene = scene_of(truth, np.ones(8))
-    state = state_of(scene, truth)
-    assert "nothing done" in switch_exposure_on(
-        state, iteration_of(scene), min_exposure_gain=0.05, min_antialiasing_gain=0.05
+def disturb(views):
+    """Multiply photographs by gains."""
+    return tuple(
+        view._replace(image=np.rint(DARKER * gain * view.image).clip(0, 255).astype(np.uint8))
+        for view, gain in zip(views, GAINS, strict=False)
     )
-    assert state.shared == {} and state.pace == Pace()
-
-
-def test_different_exposures_switch_them_on(disturbed, truth):
-    """They begin with the gains, relative to the geometric mean; held-out views begin with the identity."""
-    state = state_of(disturbed, truth)
-    iteration = iteration_of(disturbed)
-    switch_exposure_on(state, iteration, min_exposure_gain=0.05, min_antialiasing_gain=0.05)
-    ids, held = trained_ids(8, ADAPTIVE.cooling, Pace()), held_out_ids(8, 8)
-    relative = np.log(GAINS[ids]) - np.log(GAINS[ids]).mean()
-    exposures = state.shared[EXPOSURES]
-    assert_allclose(exposures[ids, 0, 0], np.exp(relative), atol=ROUNDED)
-    assert_array_equal(exposures[held], np.tile(np.eye(3, 4), (len(held), 1, 1)))
-    assert state.pace.switched_on == ("exposure",) and state.pace.decisions[0].what == "exposures"
-    assert not state.shared_adam.first[EXPOSURES].any() and state.shared_adam.second[EXPOSURES].shape == (8, 3, 4)
-    assert "are on" in switch_exposure_on(state, iteration, min_exposure_gain=0.05, min_antialiasing_gain=0.05)
-
-
-def test_the_mean_stays_the_identity(disturbed, truth):
-    state = state_of(disturbed, truth)
-    hold_mean_exposure(state, iteration_of(disturbed))  # nothing to hold
-    switch_exposure_on(state, iteration_of(disturbed), min_exposure_gain=0.05, min_antialiasing_gain=0.05)
-    ids, held = trained_ids(8, ADAPTIVE.cooling, Pace()), held_out_ids(8, 8)
-    state.shared[EXPOSURES] += np.float32(0.1)
-    before = state.shared[EXPOSURES].copy()
-    hold_mean_exposure(state, iteration_of(disturbed, 601))
-    after = state.shared[EXPOSURES]
-    assert_allclose(after[ids].mean(axis=0), np.eye(3, 4), atol=1e-6)
-    assert_allclose(after[ids] - after[ids[0]], before[ids] - before[ids[0]], atol=1e-6)
-    state.pace = state.pace._replace(cooling_from=700, last_step=900, is_pruning=True)
-    hold_mean_exposure(state, iteration_of(disturbed, 701))
-    assert_array_equal(state.shared[EXPOSURES][held], before[held])
-    take_all_views(state, iteration_of(disturbed, 750))
-    hold_mean_exposure(state, iteration_of(disturbed, 751))
-    joined = state.shared[EXPOSURES]
-    assert_allclose(joined.mean(axis=0), np.eye(3, 4), atol=1e-6)
-    ratios = joined[held, 0, 0] / joined[held[0], 0, 0]
-    assert_allclose(ratios, GAINS[held] / GAINS[held[0]], rtol=0.05)  # read off a scene that is too dark by the mean
 
 
 def early(recipe):
-    """The recipe, which asks at a fifth of the iterations, measures every 20th, and keeps opacities as they are."""
+    """The recipe, which asks at a fifth of the iterations, and measures every 20th."""
 
     def changed(event):
         if isinstance(event, At):
@@ -122,30 +43,103 @@ def early(recipe):
         return event._replace(period=20, start=20) if isinstance(event, Every) else event
 
     events = tuple(changed(event) for event in recipe.events)
-    return configure(recipe._replace(events=events, iterations=320), min_step=10_000, min_antialiasing_gain=np.inf)
+    return configure(recipe._replace(events=events, iterations=320), min_step=10_000)
 
 
-def test_training_recovers_the_gains_and_continues_byte_for_byte(disturbed, tmp_path):
+@pytest.fixture(scope="module")
+def walls():
+    """A room whose walls are bare: texture would blur what its few pixels show of a point."""
+    return make_scene("plain-wall", supersampling=1, test_every=1000, **SETTINGS).scene
+
+
+@pytest.fixture(scope="module")
+def disturbed(walls):
+    return walls._replace(train_views=disturb(walls.train_views))
+
+
+def test_all_photographs_have_the_planted_exposures(disturbed):
+    """Held-out training views as well; relative to the geometric mean, which the scene's colours take."""
+    state, n = initial_state(disturbed, ADAPTIVE, 0), len(disturbed.train_views)
+    planted = np.log(GAINS[:n]) - np.log(GAINS[:n]).mean()
+    held = held_out_ids(n, ADAPTIVE.cooling.hold_out_every)
+    found = np.log(state.shared[EXPOSURES][:, range(3), range(3)])
+    assert len(held) >= 2 and np.abs(planted[held]).max() > 0.02
+    assert_allclose(found, np.tile(planted[:, None], 3), atol=0.03)
+    assert state.pace.switched_on == ("exposure",) and state.pace.decisions[0].step == 0
+
+
+@pytest.mark.parametrize("without", ["gains", "tracks", "request"])
+def test_no_exposures_without_evidence(walls, disturbed, without):
+    """Photographs that do not differ, that have no tracks, or whose exposures nobody wants."""
+    views = tuple(view._replace(point_ids=None) for view in disturbed.train_views)
+    scene = {"gains": walls, "tracks": disturbed._replace(train_views=views), "request": disturbed}[without]
+    state = initial_state(scene, configure(ADAPTIVE, exposure=NONE) if without == "request" else ADAPTIVE, 0)
+    assert state.shared == {} and state.pace == Pace()
+
+
+def test_training_keeps_the_gains_and_continues_byte_for_byte(disturbed, tmp_path):
     recipe = early(ADAPTIVE)
     saved = []
 
     def save(report):
-        if report.step in (150, 250):  # with exposures, before the cool-down and in it
+        if report.step in (150, 250):  # before the cool-down and in it
             saved.append(tmp_path / f"{report.step}.npz")
             save_state(saved[-1], report.state, recipe)
 
     straight = train(disturbed, recipe, seed=0, on_step=save)
-    whats = [decision.what for decision in straight.pace.decisions]
-    assert whats[:2] == ["exposures", "cool down"] and set(whats[2:]) == {"prune", "prune ended", "bands"}
-    found = straight.shared[EXPOSURES][:, :, :3].trace(axis1=1, axis2=2) / 3
-    assert np.corrcoef(found, GAINS)[0, 1] > 0.95
+    assert straight.pace.decisions[0].what == "exposures"
+    assert {"cool down", "prune"} <= {decision.what for decision in straight.pace.decisions}
+    assert_array_equal(straight.shared[EXPOSURES], initial_state(disturbed, recipe, 0).shared[EXPOSURES])
     for path in saved:
         state = train(disturbed, recipe, seed=0, state=load_state(path, recipe))
         for field, other in zip(state.gaussians, straight.gaussians, strict=True):
             assert_array_equal(field, other)
         assert_array_equal(state.shared[EXPOSURES], straight.shared[EXPOSURES])
+        assert state.pace == straight.pace
     arrays, metadata = load_checkpoint(saved[0])
     pace = {**metadata["pace"], "switched_on": ["fog"]}
     save_checkpoint(saved[0], arrays, {**metadata, "pace": pace})
     with pytest.raises(DamagedCheckpoint, match="calibration that does not exist"):
         load_state(saved[0], recipe)
+
+
+def test_held_out_views_are_measured_better_with_their_exposures(disturbed):
+    """By several decibels: their gains are from 0.8 to 1.25 of the mean."""
+    psnrs = {}
+    for recipe in (early(ADAPTIVE), early(configure(ADAPTIVE, exposure=NONE))):
+        state = train(disturbed, recipe._replace(iterations=160), seed=0)
+        psnrs[recipe.exposure] = state.pace.measurements[-1].psnr
+    assert psnrs["tracks"] > psnrs["none"] + 1
+
+
+def test_learned_exposures_begin_with_the_identity_and_held_out_views_keep_it(disturbed):
+    """Until the rates fall and they are trained on, too."""
+    recipe = configure(early(ADAPTIVE), exposure=LEARNED)
+    seen = []
+    train(
+        disturbed,
+        recipe._replace(iterations=60),
+        seed=0,
+        on_step=lambda report: seen.append((report.step, report.state.pace, report.state.shared[EXPOSURES].copy())),
+    )
+    n, every = len(disturbed.train_views), ADAPTIVE.cooling.hold_out_every
+    step, pace, exposures = [each for each in seen if each[1].cooling_from is None][-1]
+    assert step > n and pace.decisions == ()
+    assert_array_equal(exposures[held_out_ids(n, every)], np.tile(IDENTITY, (len(held_out_ids(n, every)), 1, 1)))
+    assert (exposures[trained_ids(n, ADAPTIVE.cooling, Pace())] != IDENTITY).any(axis=(1, 2)).all()
+    assert (seen[-1][2][held_out_ids(n, every)] != IDENTITY).any()
+
+
+def test_the_default_recipe_says_so(tmp_path):
+    """Its decision is in the file and in the report, unless exposures are turned off."""
+    folder, made = tmp_path / "nook", make_scene("plain-wall", supersampling=1, test_every=6, **SETTINGS)
+    scene = made.scene._replace(train_views=disturb(made.scene.train_views))
+    write_scene(made._replace(scene=scene), folder, SETTINGS)
+    for out, options, whats in (("tracks", [], ["exposures"]), ("none", ["--set", "exposure=none"], [])):
+        command = ["train", str(folder), "--iterations", "24", "--test-every", "6", "--out", str(tmp_path / out)]
+        assert main([*command, *options]) == 0
+        decisions = json.loads((tmp_path / out / "decisions.json").read_text())
+        assert [each["what"] for each in decisions["decisions"] if each["step"] == 0] == whats
+        report = (tmp_path / out / "report.html").read_text()
+        assert ("Before the first iteration each photograph got its own exposure" in report) == bool(whats)
+    assert get_recipe("adaptive", 24).exposure == "tracks"
