@@ -161,4 +161,4 @@ def test_a_slice_that_is_left_out_is_measured_too(setting):
     run(1097, psnr=20.3, max_psnr_cost=0.61)
     assert state.pace.is_pruning
     run(1145, psnr=20.3, max_psnr_cost=0.19)
-    assert not state.pace.is_pruning and "0.20 dB and 0.0000 of SSIM" in state.pace.decisions[-1].why
+    assert not state.pace.is_pruning and "0.20 ± 0.00 dB and 0.0000 ± 0.0000 of SSIM" in state.pace.decisions[-1].why
