@@ -134,8 +134,10 @@ def store_gains(scene: Scene) -> Scene:
     gains = estimate_gains(scene)
     if not gains.are_needed:
         return scene
-    trained = [g if known else None for g, known in zip(gains.log_gains, gains.is_known, strict=True)]
-    held_out = [fit_gain_of_view(view, gains, scene.points) for view in scene.test_views]
+    level = np.log(np.exp(gains.log_gains[gains.is_known]).mean(axis=0))  # [3] so that the mean exposure is 1
+    trained = [g - level if known else None for g, known in zip(gains.log_gains, gains.is_known, strict=True)]
+    fitted = (fit_gain_of_view(view, gains, scene.points) for view in scene.test_views)
+    held_out = [None if g is None else g - level for g in fitted]
     return scene._replace(
         train_views=tuple(v._replace(log_gain=g) for v, g in zip(scene.train_views, trained, strict=True)),
         test_views=tuple(v._replace(log_gain=g) for v, g in zip(scene.test_views, held_out, strict=True)),

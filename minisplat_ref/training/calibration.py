@@ -18,8 +18,8 @@ as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code mul
 stores the transpose of A_v. It also clamps c' to [0, 1], which stops the gradient where the result is too bright; here
 nothing is clamped. The scene's colours and the maps are determined up to one map that all views share. With
 ``exposure=learned`` the maps are trained. With ``exposure=tracks`` they are the gains that the tracks of structure from
-motion show before any training (:mod:`minisplat_ref.strategy.track_gains`), and stay as they are; where the tracks show
-no difference there are none.
+motion show before any training (:mod:`minisplat_ref.strategy.track_gains`), and stay as they are; with
+``exposure=refined`` they begin there and are trained. Where the tracks show no difference there are none.
 
 *Pose*: the pose of view v is corrected on its left, ``R' = Q_v R, t' = Q_v t + u_v`` with ``Q_v = exp([w_v]_x)``, for a
 rotation vector w (radians, camera frame) and a shift u (world units, camera frame). The scene and the poses are
@@ -60,8 +60,9 @@ class Calibration(NamedTuple):
 
 # --- exposure ---
 
-NONE, TRACKS, LEARNED = EXPOSURE_SOURCES = ("none", "tracks", "learned")
-"""What ``--set exposure=`` takes: no exposures, those that the tracks show, or exposures that are trained."""
+NONE, TRACKS, REFINED, LEARNED = EXPOSURE_SOURCES = ("none", "tracks", "refined", "learned")
+"""What ``--set exposure=`` takes: no exposures, those that the tracks show, the same with training, or training
+alone."""
 
 
 def identity_exposures(n_views: int) -> dict[str, Floats]:

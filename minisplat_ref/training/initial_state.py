@@ -13,7 +13,7 @@ from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.track_gains import spread_of_gains, store_gains
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.calibration import EXPOSURE, TRACKS, exposures_of_gains
+from minisplat_ref.training.calibration import EXPOSURE, REFINED, TRACKS, exposures_of_gains
 from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.training.pace import Decision, Pace
 from minisplat_ref.training.recipe_settings import apply_decisions, settings_of
@@ -63,7 +63,9 @@ def initial_state(
     for calibration in recipe.active_calibrations:
         shared |= calibration.initial(n_views)
     pace = Pace()
-    if recipe.exposure == TRACKS and (spread := spread_of_gains(photographs := store_gains(scene).train_views)):
+    if recipe.exposure in (TRACKS, REFINED) and (
+        spread := spread_of_gains(photographs := store_gains(scene).train_views)
+    ):
         shared |= exposures_of_gains(photographs)
         why = f"exposures differ by {spread:.1%}, as the tracks of the sparse points show"
         pace = Pace(decisions=(Decision(0, "exposures", why, None, None),), switched_on=(EXPOSURE.name,))

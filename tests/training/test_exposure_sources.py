@@ -115,7 +115,7 @@ def test_gains_are_stored_with_the_photographs_once(exposed, room):
 
 
 def test_an_unknown_source_is_refused():
-    with pytest.raises(InputError, match="exposure=guessed: choose from none, tracks, learned"):
+    with pytest.raises(InputError, match="exposure=guessed: choose from none, tracks, refined, learned"):
         recipe_with("guessed")
 
 

@@ -325,7 +325,7 @@ def test_text_becomes_a_value_of_the_present_type(name, text, value):
     ("name", "text", "message"),
     [
         ("pose", "1", "pose=1 is neither true nor false"),
-        ("exposure", "true", "exposure=true: choose from none, tracks, learned"),
+        ("exposure", "true", "exposure=true: choose from none, tracks, refined, learned"),
         ("photometric", "much", "photometric=much is not a number, as photometric=1.0 is"),
         ("photometric", "none", "photometric=none is not a number"),
         ("photometric", "nan", "photometric=nan is not a number"),

@@ -21,7 +21,7 @@ from minisplat_ref.app.runs.simplification import Target, check_before_training
 from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.errors import InputError
 from minisplat_ref.strategy.track_gains import store_gains
-from minisplat_ref.training.calibration import TRACKS
+from minisplat_ref.training.calibration import REFINED, TRACKS
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
@@ -66,7 +66,7 @@ def prepare_continued(folder: Path, settings: Settings, state: TrainState | None
 
 def _expose(scene: Scene, recipe: Recipe) -> Scene:
     """Return the scene with the gains that its tracks show, where they are trained with or measured with."""
-    return store_gains(scene) if scene.test_views or recipe.exposure == TRACKS else scene
+    return store_gains(scene) if scene.test_views or recipe.exposure in (TRACKS, REFINED) else scene
 
 
 def _check_minutes(minutes: float | None, recipe: Recipe) -> None:

@@ -4,6 +4,7 @@ from functools import partial
 
 from minisplat_ref.methods.adaptive import numbers
 from minisplat_ref.methods.adaptive.degrees import cut_degrees_when_cooling, raise_degrees
+from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure
 from minisplat_ref.methods.adaptive.growth import collect_while_growing, grow
 from minisplat_ref.methods.adaptive.pose import hold_mean_pose, turn_held_out
 from minisplat_ref.methods.adaptive.progress import measure_held_out, proceed_when_little_is_gained
@@ -13,7 +14,7 @@ from minisplat_ref.methods.adaptive.veils import remove_veils
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, prune_faint
 from minisplat_ref.strategy.halving import OFFSET
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.calibration import TRACKS
+from minisplat_ref.training.calibration import REFINED
 from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import At, During, Every, SmallerViews
@@ -37,6 +38,7 @@ ADAPTIVE = GS._replace(
         ),
         _always(collect_while_growing),
         _always(partial(raise_degrees, views_per_coefficient=numbers.VIEWS_PER_COEFFICIENT)),
+        _always(hold_mean_exposure),
         _always(hold_mean_pose),
         At(numbers.SKY_STEP, partial(switch_sky_on, min_sky_gain=numbers.SKY_GAIN_MIN)),
         At(numbers.ANTIALIASING_STEP, partial(switch_antialiasing_on, min_antialiasing_gain=numbers.GAIN_MIN)),
@@ -80,7 +82,7 @@ ADAPTIVE = GS._replace(
     ),
     min_views=numbers.TRAIN_VIEWS_MIN,
     starts_densely=True,
-    exposure=TRACKS,
+    exposure=REFINED,
     cooling=Cooling(
         numbers.COOLING_PART,
         numbers.COOLING_LAST,

@@ -223,7 +223,7 @@ def test_out_below_a_file(refused, tmp_path):
         (["--simplify", "rank", *RECIPE], "--simplify means nothing to recipe 3dgs-accel: leave it out"),
         (["--scene-type", "indoor", "--recipe", "3dgs"], "--scene-type means nothing to recipe 3dgs: leave it out"),
         (["--set", "exposure"], "'exposure' is not NAME=VALUE"),
-        (["--set", "exposure=yes"], "exposure=yes: choose from none, tracks, learned"),
+        (["--set", "exposure=yes"], "exposure=yes: choose from none, tracks, refined, learned"),
         (["--set", "pose=yes"], "pose=yes is neither true nor false"),
         (["--set", "threshold=x"], "threshold=x is not a number"),
         (["--set", "thresholds=1", *RECIPE], "no thresholds to set: choose from antialiasing, "),
@@ -432,7 +432,7 @@ def test_resume_without_or_with_a_damaged_checkpoint(refused, tmp_path):
 
 def test_run_without_test_views(refused, tmp_path):
     run = write_run(tmp_path / "run", tmp_path / "scene")
-    assert "no test views" in refused("render", run)
+    assert "no test views" in refused("render", run, "--cameras", "test")
 
 
 def test_ply_has_no_cameras_of_its_own(refused, tmp_path):

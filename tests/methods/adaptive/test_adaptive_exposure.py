@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from adaptive_states import iteration_of
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.training.calibration import EXPOSURES, LEARNED, NONE
 from minisplat_ref.training.initial_state import initial_state
@@ -58,14 +60,32 @@ def disturbed(walls):
 
 
 def test_all_photographs_have_the_planted_exposures(disturbed):
-    """Held-out training views as well; relative to the geometric mean, which the scene's colours take."""
+    """Held-out training views as well; relative to their mean, which the scene's colours take."""
     state, n = initial_state(disturbed, ADAPTIVE, 0), len(disturbed.train_views)
-    planted = np.log(GAINS[:n]) - np.log(GAINS[:n]).mean()
+    planted = np.log(GAINS[:n] / GAINS[:n].mean())
     held = held_out_ids(n, ADAPTIVE.cooling.hold_out_every)
     found = np.log(state.shared[EXPOSURES][:, range(3), range(3)])
     assert len(held) >= 2 and np.abs(planted[held]).max() > 0.02
     assert_allclose(found, np.tile(planted[:, None], 3), atol=0.03)
+    assert_allclose(state.shared[EXPOSURES].mean(axis=0), IDENTITY, atol=1e-6)
     assert state.pace.switched_on == ("exposure",) and state.pace.decisions[0].step == 0
+
+
+def test_the_mean_is_held_by_the_views_in_training(disturbed):
+    """Twelve views, two of them held out; all maps 0.1 too large, so that those in training give 0.12 each."""
+    state, n = initial_state(disturbed, ADAPTIVE, 0), len(disturbed.train_views)
+    held, trained = held_out_ids(n, ADAPTIVE.cooling.hold_out_every), trained_ids(n, ADAPTIVE.cooling, Pace())
+    before = state.shared[EXPOSURES].copy()
+    hold_mean_exposure(state, iteration_of(disturbed))
+    assert_array_equal(state.shared[EXPOSURES], before)  # the mean is where it should be
+    state.shared[EXPOSURES] += np.float32(0.1)
+    hold_mean_exposure(state, iteration_of(disturbed))
+    assert (n, len(held)) == (12, 2)
+    assert_allclose(state.shared[EXPOSURES][held] - before[held], 0.1, atol=1e-6)
+    assert_allclose(state.shared[EXPOSURES][trained] - before[trained], 0.1 - 0.12, atol=1e-6)
+    state.shared = {}
+    hold_mean_exposure(state, iteration_of(disturbed))
+    assert state.shared == {}
 
 
 @pytest.mark.parametrize("without", ["gains", "tracks", "request"])
@@ -77,7 +97,7 @@ def test_no_exposures_without_evidence(walls, disturbed, without):
     assert state.shared == {} and state.pace == Pace()
 
 
-def test_training_keeps_the_gains_and_continues_byte_for_byte(disturbed, tmp_path):
+def test_training_refines_the_gains_and_continues_byte_for_byte(disturbed, tmp_path):
     recipe = early(ADAPTIVE)
     saved = []
 
@@ -89,7 +109,10 @@ def test_training_keeps_the_gains_and_continues_byte_for_byte(disturbed, tmp_pat
     straight = train(disturbed, recipe, seed=0, on_step=save)
     assert straight.pace.decisions[0].what == "exposures"
     assert {"cool down", "prune"} <= {decision.what for decision in straight.pace.decisions}
-    assert_array_equal(straight.shared[EXPOSURES], initial_state(disturbed, recipe, 0).shared[EXPOSURES])
+    assert (straight.shared[EXPOSURES] != initial_state(disturbed, recipe, 0).shared[EXPOSURES]).any(axis=(1, 2)).all()
+    assert_allclose(straight.shared[EXPOSURES].mean(axis=0), IDENTITY, atol=1e-5)
+    found = straight.shared[EXPOSURES][:, :, :3].trace(axis1=1, axis2=2) / 3
+    assert np.corrcoef(found, GAINS[: len(found)])[0, 1] > 0.95
     for path in saved:
         state = train(disturbed, recipe, seed=0, state=load_state(path, recipe))
         for field, other in zip(state.gaussians, straight.gaussians, strict=True):
@@ -109,7 +132,7 @@ def test_held_out_views_are_measured_better_with_their_exposures(disturbed):
     for recipe in (early(ADAPTIVE), early(configure(ADAPTIVE, exposure=NONE))):
         state = train(disturbed, recipe._replace(iterations=160), seed=0)
         psnrs[recipe.exposure] = state.pace.measurements[-1].psnr
-    assert psnrs["tracks"] > psnrs["none"] + 1
+    assert psnrs["refined"] > psnrs["none"] + 1
 
 
 def test_learned_exposures_begin_with_the_identity_and_held_out_views_keep_it(disturbed):
@@ -135,11 +158,11 @@ def test_the_default_recipe_says_so(tmp_path):
     folder, made = tmp_path / "nook", make_scene("plain-wall", supersampling=1, test_every=6, **SETTINGS)
     scene = made.scene._replace(train_views=disturb(made.scene.train_views))
     write_scene(made._replace(scene=scene), folder, SETTINGS)
-    for out, options, whats in (("tracks", [], ["exposures"]), ("none", ["--set", "exposure=none"], [])):
+    for out, options, whats in (("refined", [], ["exposures"]), ("none", ["--set", "exposure=none"], [])):
         command = ["train", str(folder), "--iterations", "24", "--test-every", "6", "--out", str(tmp_path / out)]
         assert main([*command, *options]) == 0
         decisions = json.loads((tmp_path / out / "decisions.json").read_text())
         assert [each["what"] for each in decisions["decisions"] if each["step"] == 0] == whats
         report = (tmp_path / out / "report.html").read_text()
         assert ("Before the first iteration each photograph got its own exposure" in report) == bool(whats)
-    assert get_recipe("adaptive", 24).exposure == "tracks"
+    assert get_recipe("adaptive", 24).exposure == "refined"
