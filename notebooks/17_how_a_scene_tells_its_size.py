@@ -243,9 +243,9 @@ for name, (psnrs, counts) in around.items():
 # gains differ, by more than 2 % and three times their error, and if the gains of half of the points explain the other
 # half, each photograph begins with its gain. With `exposure=tracks` it stays as it is; `adaptive` trains it further,
 # as an affine map of the colours, and holds the mean of all. The held-out views keep the gains of their tracks, with
-# which they are measured. The resolution of photographs and their poses are checked later, at iterations 650 and 700, when the
-# scene is a blur in the right place: by what compensated opacities would change, and by displacements, that are fitted
-# to one half of each photograph and have to explain the other.
+# which they are measured. The resolution of photographs and their poses are checked later, at iterations 650 and 700,
+# when the scene is a blur in the right place: by what compensated opacities would change, and by displacements, that
+# are fitted to one half of each photograph and have to explain the other.
 #
 # Here each photograph of a smaller bare room is multiplied by a gain between 0.7 and 1.4, and two short trainings see
 # them, with the exposures that the tracks show and without.

@@ -122,7 +122,8 @@ def _torn(folder: Path, share: float, is_colmap: bool) -> None:
         shutil.rmtree(scene / "sparse")
         for frame in content["frames"]:
             frame["file_path"] = str(Path(frame["file_path"]).with_suffix(".jpe"))
-        size = Image.open(scene / "images" / f"{NAMES[1]}.jpe").size
+        with Image.open(scene / "images" / f"{NAMES[1]}.jpe") as image:
+            size = image.size
         (scene / "transforms.json").write_text(json.dumps({**content, "w": size[0], "h": size[1], "cx": 24, "cy": 18}))
     lines = [
         refused("train", scene, "--undistort", *OPTIONS, "--out", folder / "run", names=torn),

@@ -32,10 +32,11 @@ KNOWN = (
      "a method that lights materials"),
     (r"(obj_dc|semantic|sem|ins_feat|language_feature|lang_feat|seg|identity)(_\d+)?", "labels, not of the image"),
     (r"red|green|blue|r|g|b|alpha|a|uchar_.*", "colours for programs that show points"),
-    (r"importance(_score)?|max_radii2d|mask(_\d+)?|confidence|error|label|class|id|level", "notes of a training"),
+    (r"importance(_score)?|max_radii2d|mask(_\d+)?|confidence|error|class|id|level", "notes of a training"),
 )  # fmt: skip
 """Names of columns, upper and lower case alike, and what they belong to."""
 
+OWN = frozenset({"label"})  # columns that commands here write, and that nothing draws
 N_NAMED = 6  # columns of one kind that are named
 N_MIN = 10  # Gaussians from which on ranges say something
 LOG_SCALE_LOW = 0.5  # median below which logarithms that are all positive are sizes
@@ -46,7 +47,7 @@ COLOR_MAX = 20.0  # of a coefficient; 1.8 is white
 def describe_columns(names: Sequence[str]) -> list[str]:
     """Return sentences about columns that 3DGS does not draw, one for each method and one for those nobody knows."""
     by_reason: dict[str, list[str]] = {}
-    for name in names:
+    for name in (name for name in names if name not in OWN):
         reason = next((reason for pattern, reason in KNOWN if re.fullmatch(pattern, name.casefold())), "")
         by_reason.setdefault(reason, []).append(name)
     unknown = by_reason.pop("", [])

@@ -147,7 +147,8 @@ def test_dense_features_where_points_are_few(shots, tmp_path, capsys):
     """24 photographs of 256 pixels give too few points for auto; dense finds more, and both results are named."""
     write_photographs(tmp_path / "photos", shots[:8:2], (None,) * 4)
     assert run_sfm(tmp_path / "photos", tmp_path / "scene") == 0
-    _, kept, *others, _, _ = capsys.readouterr().out.splitlines()
+    _, kept, *others, exposures, _, _ = capsys.readouterr().out.splitlines()
+    assert exposures.startswith("exposures of the photographs ")
     assert "mapper with dense features: 4 photographs, " in kept
     assert [line.startswith("not kept: ") for line in others] == [True] * 3
     n_points = [int(line.split(" photographs, ")[1].split()[0]) for line in (kept, *others)]

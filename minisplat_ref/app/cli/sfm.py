@@ -96,9 +96,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _summarize(result: "SfmResult", out: Path, matching: str) -> list[str]:
     """Return the lines that are printed."""
-    from minisplat_ref.app.runs.notices import describe_exposures
     from minisplat_ref.datasets.sfm import advice
-    from minisplat_ref.io import load_scene
 
     n_placed = result.n_photos - len(result.left_out)
     placed = f"{n_placed} of {result.n_photos} photographs ({n_placed / result.n_photos:.0%})"
@@ -116,8 +114,15 @@ def _summarize(result: "SfmResult", out: Path, matching: str) -> list[str]:
         lines.append(f"one camera for each size, camera and focal length: {cameras}")
     if result.n_masks:
         lines.append(f"masks: of {result.n_masks} photographs; no features were looked for where they are black")
-    lines.append(f"exposures of the photographs {describe_exposures(load_scene(out, undistort=True))}")
-    return [*lines, *_propose_training(result, out)]
+    return [*lines, _describe_exposures(out), *_propose_training(result, out)]
+
+
+def _describe_exposures(out: Path) -> str:
+    """Return what the tracks of the scene show about the exposures of its photographs."""
+    from minisplat_ref.app.runs.notices import describe_exposures
+    from minisplat_ref.io import load_scene
+
+    return f"exposures of the photographs {describe_exposures(load_scene(out, undistort=True))}"
 
 
 def _describe(mapped: "Mapped", n_matches: int) -> str:

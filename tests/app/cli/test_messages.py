@@ -260,8 +260,9 @@ RESULT = sfm.SfmResult(
 def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: RESULT)
+    monkeypatch.setattr(sfm_command, "_describe_exposures", lambda out: f"exposures of {out}")
     assert main(["sfm", "photos", "--out", "my scene"]) == 0
-    *lines, advice, cameras, masks, sizes, following = capsys.readouterr().out.splitlines()
+    *lines, advice, cameras, masks, exposures, sizes, following = capsys.readouterr().out.splitlines()
     assert lines == [
         "my scene: 8 of 15 photographs (53%), 1234 points, reprojection error 0.50 px",
         "kept: global mapper with dense features: 8 photographs, 1234 points; explains 99% of the matches",
@@ -276,6 +277,7 @@ def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
         " 6 of 768 x 1024"
     )
     assert masks == "masks: of 2 photographs; no features were looked for where they are black"
+    assert exposures == "exposures of my scene"
     assert sizes == (
         "photographs of 1600 x 1200 (7 of them) and 1200 x 1600 (1 of them) pixels; begin at 533 x 400, which a laptop"
         " trains in minutes"
@@ -288,8 +290,9 @@ def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
 def test_summary_names_only_what_is_there(tmp_path, capsys, monkeypatch):
     plain = RESULT._replace(left_out=(), groups={GROUP: 15}, n_masks=0, sizes=((480, 320),) * 15)
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: plain)
+    monkeypatch.setattr(sfm_command, "_describe_exposures", lambda out: "exposures")
     assert main(["sfm", "photos", "--out", str(tmp_path / "scene")]) == 0
-    first, kept, *others, sizes, following = capsys.readouterr().out.splitlines()
+    first, kept, *others, _, sizes, following = capsys.readouterr().out.splitlines()
     assert ": 15 of 15 photographs (100%), " in first
     assert kept.startswith("kept: ") and len(others) == 2
     assert sizes == "photographs of 480 x 320 pixels"
