@@ -10,8 +10,15 @@ SLOW = {  # seconds each; a quicker case of the same kind is run every time
 }
 
 
+PIPES = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio-ffmpeg leaves them open
+
+
+def marks_of(name):
+    return [*([pytest.mark.slow] if name in SLOW else []), *([PIPES] if name.startswith("video ") else [])]
+
+
 CASES = [
-    pytest.param(case, id=f"{kind}-{name}", marks=[pytest.mark.slow] if name in SLOW else [])
+    pytest.param(case, id=f"{kind}-{name}", marks=marks_of(name))
     for kind, cases in KINDS.items()
     for name, case in cases.items()
 ]
