@@ -6,8 +6,9 @@ compared with its photograph after the best affine map of its colours:
 * *fine* is the part of the squared error that remains after a Gaussian mean over ``FINE`` pixels is subtracted;
 * *edges* is the sum of the lengths of the rendering's gradients over that of the photograph's;
 * *moved* is what it gains, in dB of the squared error, if patches of ``PATCH`` pixels move by up to ``REACH`` pixels.
-  The displacement of a patch's left half is judged on its right half, and vice versa, so that noise gains nothing; a
-  half moves if this lowers its own error by the fraction ``FALL_MIN``, as flat halves fit everywhere;
+  The displacement of a patch's left half is judged on its right half, and vice versa, so that noise gains nothing. A
+  patch moves where those of both halves agree to a pixel, and each lowers the error by the fraction ``FALL_MIN``, as
+  flat halves fit everywhere;
 * *warped* is what one affine displacement of the whole image gains, ``d = A (1, x, y)``, fitted to half of the patches
   and judged on the other half. A wrong pose or focal length moves an image about like this, a wrong surface does not.
 
@@ -101,8 +102,10 @@ def gain_of_moved_patches(image: Floats, photograph: Floats, counted: Bools) -> 
     shifts = [(dv, du) for dv in range(-REACH, REACH + 1) for du in range(-REACH, REACH + 1)]
     errors = np.stack([_half_patches(_squared_error(image, photograph, counted, shift)) for shift in shifts])  # [S,Q,2]
     still = shifts.index((0, 0))
-    is_moved = errors.min(axis=0) < (1 - FALL_MIN) * errors[still]
-    best = np.where(is_moved, errors.argmin(axis=0), still)  # [Q, 2]
+    best = errors.argmin(axis=0)  # [Q, 2]
+    is_moved = (errors.min(axis=0) < (1 - FALL_MIN) * errors[still]).all(axis=1)
+    is_moved &= np.abs(np.diff(np.array(shifts)[best], axis=1)).max(axis=(1, 2)) <= 1
+    best[~is_moved] = still
     patches = np.arange(errors.shape[1])
     after = errors[best[:, 0], patches, 1] + errors[best[:, 1], patches, 0]
     return _decibels(errors[still].sum(), after.sum())
