@@ -15,10 +15,11 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import Renderer
-from minisplat_ref.training.calibration import EXPOSURE, EXPOSURE_SOURCES, HELD_EXPOSURE, LEARNED, TRACKS
+from minisplat_ref.training.calibration import EXPOSURE, EXPOSURE_SOURCES, HELD_EXPOSURE, LEARNED, REFINED, TRACKS
+from minisplat_ref.training.exposure_gauge import hold_mean_exposure
 from minisplat_ref.training.pace import Pace
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.training.schedule import Recipe, bound_settings
+from minisplat_ref.training.schedule import During, Recipe, bound_settings, does
 from minisplat_ref.types import Model
 
 START = "starts_densely"
@@ -100,7 +101,14 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
             starts_densely=value if name == START else recipe.starts_densely,
             exposure=value if is_source else recipe.exposure,
         )
-    return recipe
+    return _hold_refined_exposures(recipe)
+
+
+def _hold_refined_exposures(recipe: Recipe) -> Recipe:
+    """Return the recipe with the event that holds the mean of exposures that are refined, first of all."""
+    if recipe.exposure != REFINED or any(does(event, hold_mean_exposure) for event in recipe.events):
+        return recipe
+    return recipe._replace(events=(During(hold_mean_exposure, reads_parameters=False), *recipe.events))
 
 
 def _configure_representation(representation: Representation, name: str, value: Any) -> Representation:

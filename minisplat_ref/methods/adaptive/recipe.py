@@ -4,7 +4,6 @@ from functools import partial
 
 from minisplat_ref.methods.adaptive import numbers
 from minisplat_ref.methods.adaptive.degrees import cut_degrees_when_cooling, raise_degrees
-from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure
 from minisplat_ref.methods.adaptive.growth import collect_while_growing, grow
 from minisplat_ref.methods.adaptive.pose import hold_mean_pose, turn_held_out
 from minisplat_ref.methods.adaptive.progress import measure_held_out, proceed_when_little_is_gained
@@ -15,6 +14,7 @@ from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, prune_faint
 from minisplat_ref.strategy.halving import OFFSET
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import REFINED
+from minisplat_ref.training.exposure_gauge import hold_mean_exposure
 from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import At, During, Every, SmallerViews

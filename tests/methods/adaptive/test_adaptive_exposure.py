@@ -12,9 +12,9 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.training.calibration import EXPOSURES, LEARNED, NONE
+from minisplat_ref.training.exposure_gauge import hold_mean_exposure
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids

@@ -1,4 +1,4 @@
-"""Exposure of each photograph: ``adaptive`` begins with the gains that tracks show, trains them, and holds their mean.
+"""The mean exposure of photographs: ``exposure=refined`` begins with the gains that tracks show, and holds their mean.
 
 A gain that is the same in all channels and at every brightness is the first approximation of what a camera does; white
 balance and the curve from light to bytes are the next, for which an affine map has room
@@ -8,7 +8,7 @@ more than the gains alone (``docs/measured/adaptive.md``, N).
 Scene and exposures are determined up to a map that all photographs share, and which would drift: a scene twice as
 bright with half the exposures looks the same in all training views, and wrong in every other. The mean of the exposures
 is therefore kept at the identity, by the views in training alone: the held-out ones keep what their tracks show, with
-which they are measured.
+which they are measured. ``exposure=learned`` is that of the 2024 update of 3DGS, which lets it drift.
 """
 
 import numpy as np
