@@ -171,6 +171,9 @@ class Scene(NamedTuple):
     frame: Frame = FILE_FRAME
     """The frame of cameras, points and extent: that of the files, unless :func:`minisplat_ref.io.frames.place_scene`
     has moved or scaled the scene."""
+    random_box: Floats | None = None
+    """[2, 3] lowest and highest corner of the box in which random points are drawn where there are no points, world
+    frame; None: around the cameras."""
 
     def __repr__(self) -> str:
         return one_line(self)

@@ -137,6 +137,7 @@ def place_scene(scene: Scene, frame: Frame | None = None) -> Scene:
         points=place_points(scene.points, frame),
         extent=scene.extent / frame.unit,
         frame=frame,
+        random_box=None if scene.random_box is None else place_points(scene.random_box, frame),
     )
 
 

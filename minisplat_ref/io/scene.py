@@ -82,6 +82,8 @@ class Listing(NamedTuple):
     """[P, 3]"""
     alpha_is_mask: bool
     """As :attr:`Reading.alpha_is_mask`, which the format of the scene decides."""
+    random_box: Floats | None = None
+    """As :attr:`minisplat_ref.types.Scene.random_box`."""
 
 
 class Reading(NamedTuple):
@@ -162,7 +164,7 @@ def build_scene(listing: Listing, reading: Reading) -> Scene:
     InputError
         If there are too few views, a camera is not usable, or an image is missing or does not fit its camera.
     """
-    source, train_photos, test_photos, names, points, point_colors, _ = listing
+    source, train_photos, test_photos, names, points, point_colors, _, random_box = listing
     photos = (*train_photos, *test_photos)
     if len(train_photos) < TRAIN_VIEWS_MIN:
         raise InputError(
@@ -197,6 +199,7 @@ def build_scene(listing: Listing, reading: Reading) -> Scene:
         point_colors=point_colors,
         background=reading.background,
         extent=camera_extent(cameras),
+        random_box=random_box,
     )
 
 

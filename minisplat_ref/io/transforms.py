@@ -1,7 +1,8 @@
 """Scenes described by transforms.json, in its three dialects.
 
 * Blender (NeRF-synthetic): ``transforms_train.json`` and ``transforms_test.json``, one ``camera_angle_x``, square
-  pixels, ``file_path`` without suffix, RGBA images, points in ``points3d.ply`` if there are any.
+  pixels, ``file_path`` without suffix, RGBA images, points in ``points3d.ply`` if there are any, or else random ones in
+  the cube of these scenes.
 * nerfstudio: ``fl_x fl_y cx cy w h`` at top level or per frame, ``mask_path``, ``ply_file_path``. Its
   ``applied_transform`` has already been applied to poses and points alike, so nothing is left to do with it.
 * instant-ngp: as nerfstudio's, with ``aabb_scale``, ``scale`` and ``offset``, which only place the NeRF in its cube;
@@ -34,6 +35,9 @@ from minisplat_ref.types import Camera, Floats, Scene
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
 SINGLE_FILE = "transforms.json"
 BLENDER_POINTS = ("points3d.ply", "points3D.ply")
+BLENDER_BOX = np.array([[-1.3, -1.3, -1.3], [1.3, 1.3, 1.3]])
+"""Where the released code of 3DGS draws the points of such a scene, in ``readNerfSyntheticInfo`` of
+``scene/dataset_readers.py``."""
 OTHER_MODELS = {"PERSPECTIVE": "PINHOLE", "FISHEYE": "OPENCV_FISHEYE", "FULLOPENCV": "FULL_OPENCV"}
 """Names of camera models in other programs, by COLMAP's; upper and lower case are alike."""
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # factors of the camera's x, y and z axis
@@ -104,7 +108,9 @@ def list_transforms(path: Path, test_every: int, offset: int = 0) -> Listing:
     cloud = NO_POINTS if points_file is None else load_points(points_file)
     if cloud.dropped:
         warnings.warn(f"{points_file}: {cloud.dropped} and left out", stacklevel=2)
-    return make_listing(path, train_photos, test_photos, cloud.points, cloud.colors, alpha_is_mask=False)
+    listing = make_listing(path, train_photos, test_photos, cloud.points, cloud.colors, alpha_is_mask=False)
+    is_blender = files[0].name == BLENDER_FILES[0] and "camera_angle_x" in sets[0]
+    return listing._replace(random_box=BLENDER_BOX) if is_blender else listing
 
 
 def find_transforms(path: Path) -> tuple[Path, ...]:

@@ -18,6 +18,7 @@ N_NEIGHBOURS = 3
 SQUARED_DISTANCE_MIN = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
 INITIAL_OPACITY = 0.1
 N_RANDOM_POINTS = 100_000  # as in 3DGS for scenes without points
+GRAY = 127  # of 255. In their box, released code draws harmonics from 0 to 1/255 and not colours, as it seems to intend
 
 IsInside = Callable[[Floats, Camera], Bools]
 """``is_inside(points, camera)``: [P] whether points [P, 3] of the world are inside the camera's image."""
@@ -62,7 +63,10 @@ def initial_gaussians(
     if len(scene.points) > N_NEIGHBOURS:
         return gaussians_from_points(scene.points, scene.point_colors, sh_degree)
     cameras = [view.camera for view in scene.train_views]
-    points = random_points(cameras, scene.extent, N_RANDOM_POINTS, rng, is_inside)
+    if scene.random_box is not None:
+        points = random_points(cameras, scene.random_box, N_RANDOM_POINTS, rng, is_inside)
+        return gaussians_from_points(points, np.full(points.shape, GRAY, np.uint8), sh_degree)
+    points = random_points(cameras, box_around(cameras, scene.extent), N_RANDOM_POINTS, rng, is_inside)
     return gaussians_from_points(points, rng.integers(0, 256, points.shape, np.uint8), sh_degree)
 
 
@@ -125,20 +129,34 @@ def gaussians_from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussi
     )
 
 
-def random_points(
-    cameras: Sequence[Camera], extent: float, n: int, rng: np.random.Generator, is_inside: IsInside = may_be_inside
-) -> Floats:
-    """Return points drawn uniformly in the cube around the cameras, without those that no camera sees.
+def box_around(cameras: Sequence[Camera], extent: float) -> Floats:
+    """Return the lowest and highest corner [2, 3] of a cube that holds all cameras.
 
-    The cube is centred on the mean of the camera centres and reaches ``extent`` to each side, so it holds all cameras.
-    It covers an object that they surround, but only the near part of a landscape that they look out on. A point that no
-    camera sees would never get a gradient and would stay forever.
+    It is centred on the mean of the camera centres and reaches ``extent`` to each side. It covers an object that they
+    surround, but only the near part of a landscape that they look out on.
 
     Parameters
     ----------
     cameras : sequence of Camera
     extent : float
         ``Scene.extent``, world units.
+    """
+    centre = np.array([camera.center for camera in cameras]).mean(axis=0)
+    return np.array([centre - extent, centre + extent])
+
+
+def random_points(
+    cameras: Sequence[Camera], box: Floats, n: int, rng: np.random.Generator, is_inside: IsInside = may_be_inside
+) -> Floats:
+    """Return points drawn uniformly in a box, without those that no camera sees.
+
+    A point that no camera sees would never get a gradient and would stay forever.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    box : ndarray of shape (2, 3)
+        Lowest and highest corner, world frame.
     n : int
         Number of points drawn.
     rng : numpy.random.Generator
@@ -150,8 +168,7 @@ def random_points(
     points : ndarray of shape (P, 3), float64
         P is at most ``n``.
     """
-    centres = np.array([camera.center for camera in cameras])  # [C, 3]
-    points = centres.mean(axis=0) + rng.uniform(-extent, extent, (n, 3))  # [n, 3]
+    points = rng.uniform(box[0], box[1], (n, 3))  # [n, 3]
     return points[are_seen(points, cameras, is_inside)]
 
 

@@ -120,7 +120,9 @@ def test_a_scene_is_placed_with_all_that_it_has(scene):
         assert view.image is before.image and view.camera.fx == before.camera.fx
         center = np.array(UTM.origin) + 0.25 * view.camera.center
         np.testing.assert_allclose(center, before.camera.center, atol=1e-8)
-    assert place_scene(scene) is scene
+    assert place_scene(scene) is scene and placed.random_box is None
+    boxed = place_scene(scene._replace(random_box=np.array(UTM.origin) + np.array([[-1.3] * 3, [1.3] * 3])), UTM)
+    np.testing.assert_allclose(boxed.random_box, [[-5.2] * 3, [5.2] * 3], rtol=1e-6)
 
 
 def test_training_elsewhere_warns_with_the_figures(scene):

@@ -88,6 +88,16 @@ def test_blender(tmp_path, rng, background):
     assert load_transforms(tmp_path, test_every=0).test_views == ()
 
 
+def test_random_points_of_a_blender_scene_fill_its_cube(tmp_path, rng):
+    """Of a Blender scene alone: other exports of that file's name have other units."""
+    write_blender(tmp_path / "blender", rng)
+    scene = load_transforms(tmp_path / "blender")
+    np.testing.assert_array_equal(scene.random_box, [[-1.3] * 3, [1.3] * 3])
+    (tmp_path / "other").mkdir()
+    write_transforms(tmp_path / "other", name="transforms_train.json", fl_x=32.0)
+    assert load_transforms(tmp_path / "other").random_box is None
+
+
 def test_folds_of_photographs_that_are_held_out_already(tmp_path, rng):
     write_blender(tmp_path, rng)
     with pytest.raises(InputError, match=r"transforms_test\.json says which .* give .*transforms_train\.json as"):

@@ -7,7 +7,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.strategy import initialization
-from minisplat_ref.strategy.initialization import are_seen, gaussians_from_points, initial_gaussians, random_points
+from minisplat_ref.strategy.initialization import (
+    are_seen,
+    box_around,
+    gaussians_from_points,
+    initial_gaussians,
+    random_points,
+)
 from minisplat_ref.types import Optics, Scene, View
 from scenes import make_camera
 from tolerances import ROUNDED_TO_FLOAT32
@@ -61,7 +67,7 @@ def test_too_few_points_are_refused():
 
 def test_random_points_are_inside_the_cube_and_seen(rng):
     cameras = [make_camera(), make_camera()._replace(cam_from_world_t=np.array([0.0, 0.0, -1.0]))]  # centres z = 0, 1
-    points = random_points(cameras, 3.0, 4_000, rng)
+    points = random_points(cameras, box_around(cameras, 3.0), 4_000, rng)
     assert 100 < len(points) < 4_000  # the frusta fill part of the cube
     assert np.abs(points - [0, 0, 0.5]).max() <= 3.0
     x, y, z = points.T
@@ -102,3 +108,8 @@ def test_scene_decides_where_points_come_from(rng, monkeypatch):
     assert 3 < len(at_random.means) <= 500
     assert at_random.sh_rest.shape == (len(at_random.means), 3, 3)
     assert np.ptp(at_random.sh_dc) > 1  # colours are drawn, too
+    box = np.array([[-1.0, -2.0, 1.0], [1.0, 2.0, 3.0]])
+    boxed = initial_gaussians(make_scene(SQUARE[:3], [make_camera()])._replace(random_box=box), 1, rng)
+    assert len(boxed.means) > 100 and (boxed.means > box[0]).all() and (boxed.means < box[1]).all()
+    assert_allclose(np.abs(boxed.means[:, 2] - 2).max(), 1, atol=0.05)  # they fill it
+    assert_allclose(0.5 + SH_C0 * boxed.sh_dc, 127 / 255, atol=ROUNDED_TO_FLOAT32)
