@@ -7,6 +7,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, list_colmap, load_colmap
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.inventory import warn_of_unused
+from minisplat_ref.io.llff import POSES_BOUNDS, is_llff, list_llff
 from minisplat_ref.io.other_places import refuse_other_scene
 from minisplat_ref.io.ply import load_ply, load_points, save_ply
 from minisplat_ref.io.scene import Listing, build_reading, build_scene
@@ -47,7 +48,8 @@ def load_scene(
     Parameters
     ----------
     path : str or Path
-        Folder of a COLMAP scene or of a transforms.json (COLMAP wins where both are there), or a transforms.json file.
+        Folder of a COLMAP scene, of a transforms.json or of LLFF's poses_bounds.npy (the first of these that is there),
+        or a transforms.json file.
     downscale, test_every, background, undistort, as_photographed
         See :func:`load_colmap` and :func:`load_transforms`.
     model : str, optional
@@ -86,10 +88,12 @@ def list_scene(path: Path, test_every: int, model: str | None = None, offset: in
         return list_colmap(path, test_every, model, offset)
     if find_transforms(path):
         return list_transforms(path, test_every, offset)
+    if is_llff(path):
+        return list_llff(path, test_every, offset)
     if path.is_dir():
         refuse_other_scene(path)
     models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
     raise InputError(
-        f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"
+        f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE, POSES_BOUNDS])};"
         " to make one from photographs run `minisplat-ref sfm PHOTOS --out SCENE`"
     )

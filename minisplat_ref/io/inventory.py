@@ -66,7 +66,9 @@ def take_inventory(path: Path, scene: Scene, model: str | None = None) -> Invent
         The requested model.
     """
     folder = find_model(path, model)
-    return _take_from_transforms(path) if folder is None else _take_from_colmap(path, folder, scene)
+    if folder is not None:
+        return _take_from_colmap(path, folder, scene)
+    return _take_from_transforms(path) if find_transforms(path) else _take_from_llff(path, scene)
 
 
 def warn_of_unused(path: Path, scene: Scene, model: str | None = None) -> Inventory:
@@ -248,6 +250,17 @@ def _take_from_transforms(path: Path) -> Inventory:
         *(f"{key} of {n} frames is not used" for key in FRAME_KEYS if (n := sum(key in frame for frame in frames))),
     ]
     return Inventory(used, tuple(unused))
+
+
+def _take_from_llff(path: Path, scene: Scene) -> Inventory:
+    """All photographs have cameras, by their order; masks and other files have no place in that format."""
+    n_views = len(scene.train_views) + len(scene.test_views)
+    masks = [
+        f"{folder.name}/ has {len(_list_images(folder))} files, 0 fit: masks are those of other kinds of scenes"
+        for folder in _folders(path)
+        if MASK_FOLDERS.fullmatch(folder.name)
+    ]
+    return Inventory(f"{n_views} of {n_views} photographs have cameras", tuple(masks))
 
 
 def _unnamed_masks(folder: Path, masks: set[str]) -> list[str]:

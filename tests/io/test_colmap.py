@@ -419,7 +419,8 @@ def test_truncated_frames(tmp_path, n_bytes):
 def test_nothing_there(tmp_path):
     with pytest.raises(InputError, match=r"nowhere: no such folder"):
         load_scene(tmp_path / "nowhere")
-    looked_for = "sparse/0/cameras.bin or .txt, sparse/cameras.bin or .txt, transforms_train.json, transforms.json;"
+    looked_for = "sparse/0/cameras.bin or .txt, sparse/cameras.bin or .txt, transforms_train.json, transforms.json,"
+    looked_for += " poses_bounds.npy;"
     with pytest.raises(
         InputError, match=f"no scene here, looked for {looked_for} .*minisplat-ref sfm PHOTOS --out SCENE"
     ):
