@@ -23,6 +23,7 @@ from minisplat_ref.oracle.tolerances import (
 )
 from minisplat_ref.rendering import render
 from minisplat_ref.rendering.backends import CPU, REFERENCE
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Gaussians
 from tiny_bench import tiny, tiny_workloads, with_pixel  # noqa: F401
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
@@ -306,6 +307,41 @@ def test_stages_add_up_to_the_iteration(tmp_path, monkeypatch):
     }
     assert sum(case["share %"] for case in stages) == pytest.approx(100)
     assert all(case["ms"] > 0 for case in stages)
+
+
+def test_recipes_are_timed_beside_the_baseline(tmp_path, monkeypatch):
+    """Processor time by hand: 2 and 3 s for an iteration of ``3dgs-accel``, 5 and 7 for one of ``surfels``."""
+    clock, trained = [0.0], []
+    seconds = {"3dgs-accel": iter([2, 3, 2, 3]), "surfels": iter([7, 5, 7, 7])}
+
+    def fake_train(scene, recipe, *, seed, backend, on_step):
+        trained.append(recipe)
+        for step in range(1, recipe.iterations + 1):
+            clock[0] += 90 if step <= training_time.WARM_UP else next(seconds[recipe.name])
+            report = StepReport(step, 0.5, scene.train_views[0], None, len(scene.points), 0, None)
+            on_step(report)
+
+    monkeypatch.setattr(training_time, "DENSE_ROOM", {"n_views": 2, "width": 48, "height": 36, "n_points": 70})
+    monkeypatch.setattr(training_time, "train", fake_train)
+    monkeypatch.setattr(training_time.time, "process_time", lambda: clock[0])
+    file = tmp_path / "recipes.json"
+    assert main(["bench", "--recipes", "surfels,surfels", "--iterations", "2", "--json", str(file)]) == 0
+    report = json.loads(file.read_text())
+    cases = {case["name"]: case for case in report["cases"]}
+    assert list(cases) == ["room/3dgs-accel", "room/surfels"] and report["settings"]["iterations"] == 2
+    assert [cases[name]["least ms"] for name in cases] == [2000, 5000]
+    assert [cases[name]["iteration ms"] for name in cases] == [2500, 7000]
+    assert [cases[name]["x 3dgs-accel"] for name in cases] == [1, 2.5]
+    assert [cases[name]["primitives"] for name in cases] == [70, 70]
+    assert [recipe.name for recipe in trained] == 2 * ["3dgs-accel", "surfels"]
+    assert all(
+        not recipe.events and all(term.is_due(1) or not term.weight for term in recipe.losses) for recipe in trained
+    )
+
+
+def test_unknown_recipes_are_not_timed(capsys):
+    assert main(["bench", "--recipes", "surfelz"]) == 2
+    assert "surfelz" in capsys.readouterr().err
 
 
 def test_tasks_alternate_in_every_round(monkeypatch):

@@ -31,6 +31,7 @@ examples:
   minisplat-ref bench --workloads synth5k --backends cpu-f32,textbook-f32
   minisplat-ref bench --scene photos/fox --against opensplat=build/opensplat
   minisplat-ref bench --extension analytic
+  minisplat-ref bench --recipes surfels,lens --iterations 10
 
 Exit codes: 0 all within their bounds, 1 something failed, 2 bad input."""
 
@@ -71,8 +72,17 @@ def add_parser(commands: Commands) -> None:
     others.add_argument(
         "--extension", metavar="NAME", help="instead: an extension's renderer on both backends, beside 3DGS's"
     )
+    others.add_argument(
+        "--recipes",
+        type=list_of(name),
+        metavar="A,B",
+        help="instead: processor time of a training iteration of recipes, beside 3dgs-accel",
+    )
     parser.add_argument(
-        "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
+        "--scene",
+        type=Path,
+        metavar="SCENE",
+        help="photographs for --stages, --recipes (default a made room) and opensplat",
     )
     parser.add_argument(
         "--downscale", type=integer(1), default=1, metavar="D", help="make them D times smaller (default 1)"
@@ -113,6 +123,8 @@ def _measure(args: argparse.Namespace) -> "Report":
         return _networks(args)
     if args.extension is not None:
         return _extension(args)
+    if args.recipes:
+        return _recipes(args)
     return _benchmark(args)
 
 
@@ -168,6 +180,16 @@ def _profile(args: argparse.Namespace) -> "Report":
 
     cases = profile(args.scene, args.downscale, args.iterations)
     return Report("A training iteration by stages", tuple(cases), {"iterations": args.iterations})
+
+
+def _recipes(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.training_time import compare_recipes
+    from minisplat_ref.jit.compile import n_threads
+    from minisplat_ref.oracle.cases import Report
+
+    cases = compare_recipes(args.recipes, args.scene, args.downscale, args.iterations)
+    settings = {"iterations": args.iterations, "threads": n_threads()}
+    return Report("Processor time of a training iteration, on the same points", tuple(cases), settings)
 
 
 def _tables(report: "Report") -> str:
