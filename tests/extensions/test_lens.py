@@ -1,6 +1,7 @@
 """Lens: peaks along true rays, gradients, parity, the pinhole as the degenerate case, training as photographed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,10 +16,10 @@ from minisplat_ref.extensions.lens.model import OPTICS, THROUGH_LENS, stages
 from minisplat_ref.io import load_scene, viewpoints
 from minisplat_ref.mechanisms.cameras.gsplat_call import rasterization, rasterization_vjp
 from minisplat_ref.mechanisms.cameras.models import model_of
-from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE, hit, project
+from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE, are_reached, hit, list_tiles, project
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
-from minisplat_ref.reference.covariance import covariances
+from minisplat_ref.reference.covariance import covariances, rotation_matrices
 from minisplat_ref.rendering import SPLATTING, Request, activate
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.training.initial_state import initial_state
@@ -86,6 +87,41 @@ def test_gaussians_behind_thin_or_partly_out_of_sight():
         draw(balls([[0, 0, 2]], [0.1], [0.5]), camera._replace(optics=Optics("orthographic")), CPU)
 
 
+def test_what_no_ray_reaches_is_culled_by_hand():
+    """Rays up to 45 degrees from the axis. At 90 degrees and 2 units a ball of 2 sin(45 degrees) touches the cone.
+
+    Alpha is alpha_min at two standard deviations, so 0.707 is the standard deviation that decides.
+    """
+    rays = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 1.0]]) / np.array([[1.0, np.sqrt(2)]])
+    x, limit = np.array([[2.0, 0.0, 0.0]] * 3 + [[0.0, 0.0, 2.0], [0.0, -2.0, 2.0], [0.1, 0.0, -0.1]]), np.sqrt(0.5)
+    scales, ratio = np.array([0.999 * limit, 1.001 * limit, 2.0, 1e-9, 1e-9, 0.1]), np.exp(2.0)
+    found = are_reached(x, scales, np.full(6, ratio), rays)
+    assert found.tolist() == [False, True, True, True, True, True]
+    assert not are_reached(x[1:2], scales[1:2], np.array([0.5]), rays)
+
+
+@pytest.mark.parametrize("optics", OPTICS, ids=str)
+def test_nothing_that_a_ray_meets_is_culled_beside_the_camera(optics):
+    """Large and small Gaussians around the plane of the camera, their alphas at every pixel; most are out of sight."""
+    rng = np.random.default_rng(8)
+    camera = make_camera(36, 28, fx=40.0, fy=40.0)._replace(optics=optics)
+    means = np.column_stack([rng.uniform(-2, 2, (200, 2)), rng.uniform(0.02, 0.3, 200)])
+    scales = rng.uniform(0.02, 0.4, (200, 3))
+    p = Primitives(means, rng.normal(size=(200, 4)), scales, rng.uniform(0.1, 0.99, 200))
+    found = project(p, camera, GSPLAT_MAIN)
+    R_g = rotation_matrices(p.quats)
+    everywhere = found._replace(
+        positions=means, whitenings=np.swapaxes(R_g, 1, 2) / scales[:, :, None], opacities=p.opacities
+    )
+    xs, ys = (grid.ravel() for grid in np.meshgrid(np.arange(36), np.arange(28)))
+    largest = hit(everywhere, np.arange(200), np.stack([xs, ys], axis=1) + 0.5).unclamped.max(axis=1)
+    ratios = p.opacities / GSPLAT_MAIN.alpha_min
+    is_reached = are_reached(means, scales.max(axis=1), ratios, found.rays)
+    assert is_reached[largest >= GSPLAT_MAIN.alpha_min].all()
+    assert (largest >= GSPLAT_MAIN.alpha_min).sum() > 20 and (~is_reached).sum() > 20
+    assert not found.radii[~is_reached].any()
+
+
 # --- the renderer ---
 
 
@@ -128,6 +164,21 @@ def test_kernels_are_the_reference(dtype):
         assert_array_equal(found.stats.dominant_ids, expected.stats.dominant_ids)
         assert_allclose(found.median_depth, expected.median_depth)
         assert_allclose(v_found.means2d, v_expected.means2d, atol=PARITY_FLOAT64 * np.abs(v_expected.means2d).max())
+
+
+@pytest.mark.parametrize("optics", OPTICS, ids=str)
+def test_kernels_list_the_tiles_that_the_reference_lists(optics):
+    """All tiles under each box, on an image of several tiles, with Gaussians that are culled among them."""
+    gaussians = make_gaussians(np.random.default_rng(6), 80, size=0.3)
+    gaussians.means[::9, 2] *= -1
+    camera = make_camera(150, 90, fx=170.0, fy=160.0)._replace(optics=optics)
+    footprints = project(activate(gaussians), camera, GSPLAT_MAIN)
+    found = list_tiles(footprints, camera, CPU, GSPLAT_MAIN)
+    grid_of_kernels = replace(REFERENCE, tile_width=CPU.tile_width, tile_height=CPU.tile_height)
+    expected = list_tiles(footprints, camera, grid_of_kernels, GSPLAT_MAIN)
+    assert_array_equal(found.tile_offsets, expected.tile_offsets)
+    assert_array_equal(found.gaussian_ids, expected.gaussian_ids)
+    assert len(found.gaussian_ids) > 200 and (footprints.radii[:, 0] == 0).any()
 
 
 def test_a_shift_by_a_pixel_is_what_means2d_says():

@@ -58,13 +58,13 @@ from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
 from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.rendering.box_lists import BOUNDLESS
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import WORLD_UNITS, Representation
 from minisplat_ref.training.schedule import Every
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints, Model, Projection, RenderOutput, View
 
-BOUNDLESS = np.array([1e-12, 0.0, 1e-12])  # px^-2: a million pixels
 PLURAL = "lines and triangles"
 DEPTHS = frozenset({"depth", "normal", "spread", "median_depth"})
 """The channels that only surfaces have."""

@@ -10,8 +10,10 @@ This is the maximum of the Gaussian along the ray, so there is no expansion to b
 low-pass. Lists are ordered by the depths of the means. The image's bounds of a Gaussian come from the unscented
 transform; they alone are approximate: a pixel outside of them is not hit.
 
-A Gaussian is culled unless its depth lies between the planes, its mean is seen by the lens and it is not thinner than
-``1 / WHITENESS_MAX`` of its distance. If a sigma point is not seen, its bounds are the whole image.
+A Gaussian is culled unless its depth lies between the planes, its mean is seen by the lens, it is not thinner than
+``1 / WHITENESS_MAX`` of its distance, and some ray of the image can reach it: seen from the camera, the ball of its
+longest axis touches the cone of all rays. Beside the camera an unscented transform bounds nothing. If a sigma point is
+not seen, the bounds are the whole image.
 """
 
 from typing import NamedTuple
@@ -26,9 +28,9 @@ from minisplat_ref.reference.covariance import rotation_matrices, rotation_matri
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.reference.pinhole import pose, with_principal_point
-from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives, Projection, TileBins, TileGrid
+from minisplat_ref.rendering.box_lists import list_boxes
+from minisplat_ref.types import Bools, Camera, Floats, Ints, PrimitiveGradient, Primitives, TileBins
 
 WHITENESS_MAX = 1e12  # of |x| / s: its square is far from the end of float32
 
@@ -117,6 +119,7 @@ def project(primitives: Primitives, camera: Camera, conventions: Conventions) ->
     is_visible = (conventions.near_plane < depths) & (depths < conventions.far_plane)
     is_visible &= (opacities >= conventions.alpha_min) & model.is_seen(x, camera)
     is_visible &= (np.linalg.norm(x, axis=1)[:, None] < WHITENESS_MAX * scales).all(axis=1)
+    is_visible &= are_reached(x, scales.max(axis=1), opacities / conventions.alpha_min, rays)
     is_visible &= np.isfinite(np.column_stack([x, whitenings.reshape(-1, 9), radii, boxes])).all(axis=1)
     is_visible &= (radii > 0).all(axis=1) & (boxes[:, :2] < boxes[:, 2:]).all(axis=1)
     rows = is_visible[:, None]
@@ -132,6 +135,27 @@ def project(primitives: Primitives, camera: Camera, conventions: Conventions) ->
         rays=rays,
         camera=camera,
     )
+
+
+def are_reached(x: Floats, scales: Floats, ratios: Floats, rays: Floats) -> Bools:
+    """Return whether the balls of Gaussians touch the cone about the optical axis that holds all rays of an image, [N].
+
+    Parameters
+    ----------
+    x : ndarray of shape (N, 3)
+        Means, camera frame.
+    scales : ndarray of shape (N,)
+        Largest standard deviations; a ball has the radius ``s sqrt(2 ln(o / alpha_min))``, at which alpha is alpha_min.
+    ratios : ndarray of shape (N,)
+        ``o / alpha_min``.
+    rays : ndarray
+        Table of the unit directions of the pixels.
+    """
+    distances, radii = np.linalg.norm(x, axis=1), scales * np.sqrt(2 * np.log(np.maximum(ratios, 1)))
+    half_angle = np.arccos(np.clip(rays[2::3].min(), -1, 1))
+    beyond = np.arccos(np.clip(x[:, 2] / distances, -1, 1)) - half_angle
+    reached: Bools = (radii >= distances) | (beyond <= np.arcsin(np.minimum(radii / distances, 1)))
+    return reached
 
 
 def project_vjp(
@@ -224,9 +248,7 @@ def boxes_of(footprints: LensFootprints) -> Ints:
 
 def list_tiles(f: LensFootprints, camera: Camera, backend: Backend, conventions: Conventions) -> TileBins:
     """Return the Gaussians of each of the backend's tiles, nearest means first."""
-    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
-    ordered = Projection(f.means2d, f.depths, np.zeros((len(f.depths), 3)), f.opacities, f.radii, f.boxes)
-    return bin_gaussians(ordered, grid, conventions)
+    return list_boxes(f.depths, f.radii, f.boxes, camera, conventions, backend)
 
 
 RESPONSE = Response(boxes_of, hit, hit_vjp, ("positions", "whitenings", "opacities"))

@@ -20,7 +20,8 @@ from minisplat_ref.mechanisms.tangent.planes import (
 )
 from minisplat_ref.reference.hits import Response
 from minisplat_ref.rendering import RenderGradient, Request, activate, add_light_behind, choose_degree, parameters_vjp
-from minisplat_ref.rendering.backends import REFERENCE, Backend
+from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.rendering.box_lists import list_boxes
 from minisplat_ref.rendering.splatting import append_depths
 from minisplat_ref.types import (
     Camera,
@@ -28,10 +29,8 @@ from minisplat_ref.types import (
     Ints,
     Model,
     Primitives,
-    Projection,
     RenderOutput,
     TileBins,
-    TileGrid,
     View,
 )
 
@@ -60,11 +59,8 @@ class Prepared(NamedTuple):
 
     def listed(self) -> TileBins:
         """Return the tiles' lists, nearest means first."""
-        camera = self.footprints.camera
-        grid = TileGrid(camera.width, camera.height, self.backend.tile_width, self.backend.tile_height)
-        f, zeros = self.footprints, np.zeros((len(self.channels), 3))
-        by_distance = Projection(zeros[:, :2], f.distances, zeros, f.opacities, f.radii, f.boxes)
-        return REFERENCE.bin_gaussians(by_distance, grid, self.conventions)
+        f = self.footprints
+        return list_boxes(f.distances, f.radii, f.boxes, f.camera, self.conventions, self.backend)
 
     def blended(self, bins: TileBins, wants: frozenset[str] = frozenset()) -> RenderOutput:
         """Return the image, rendered by kernels or by the reference, and the requested statistics."""
