@@ -10,7 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
-from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, RELEASED, project
+from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, RELEASED, cut_disc_boxes, project
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS, list_tiles
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.hits import tile_hits
@@ -172,17 +172,59 @@ def test_hits_before_the_near_plane_are_dropped_one_by_one(backend):
     np.testing.assert_array_equal(output.alpha > 0, z > 3.95)
 
 
-def test_a_box_holds_all_that_is_visible(rng):
+@pytest.mark.parametrize(
+    ("size", "near", "part_cut"), [(0.5, 0.01, 0.0), (3.0, 0.01, 0.5), (3.0, 0.5, 0.5), (1.0, 0.0, 0.1)]
+)
+def test_a_box_holds_all_that_is_visible(size, near, part_cut, rng):
     """Alpha is below its least outside of every box; large discs reach behind the camera."""
-    g = make_gaussians(rng, 40, size=0.5)
+    g = make_gaussians(rng, 40, size=size)
     camera = make_camera(rng=rng)
-    surfels = project(activate(g), camera, GSPLAT_MAIN, PAPER)
+    surfels = project(activate(g), camera, GSPLAT_MAIN._replace(near_plane=near), PAPER)
     ys, xs = np.mgrid[: camera.height, : camera.width]
     found = surfel_response(Layout()).hit(surfels, np.arange(40), np.column_stack([xs.ravel(), ys.ravel()]) + 0.5)
     x0, y0, x1, y1 = surfels.boxes[:, :, None].swapaxes(0, 1)
     is_outside = ~((x0 <= xs.ravel()) & (xs.ravel() < x1) & (y0 <= ys.ravel()) & (ys.ravel() < y1))
     is_seen = surfels.radii[:, :1] > 0
     assert (is_outside & is_seen).any() and found.unclamped[is_outside & is_seen].max() < GSPLAT_MAIN.alpha_min
+    M_w = surfels.transforms[:, 2]
+    assert np.mean(3 * np.linalg.norm(M_w[:, :2], axis=1) > M_w[:, 2]) >= part_cut
+
+
+def test_the_part_of_a_floor_beyond_the_near_plane_by_hand():
+    """A disc of radius 3 at y = 1 around (0, 1, 2), cut at z = 0.5: it ends at z = 5, and is widest where it is cut.
+
+    There x^2 = 9 - 1.5^2 and x / z = sqrt(27); x / z falls with z.
+    """
+    fx, fy, cx, cy = 32.0, 30.0, 12.3, 9.1
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    T = K @ np.array([[1.5, 0, 0], [0, 0, 1], [0, 1.5, 2]])  # two standard deviations of 1.5
+    low, high = cut_disc_boxes(T[None], np.array([4.0]), 0.5)
+    assert_allclose(low[0], (cx - fx * np.sqrt(27), cy + fy / 5), rtol=CLOSED_FORM)
+    assert_allclose(high[0], (cx + fx * np.sqrt(27), cy + fy / 0.5), rtol=CLOSED_FORM)
+
+
+def test_bounds_of_cut_discs_are_those_of_their_points(rng):
+    """Against points of the circle and of the chord, which are never outside, and reach the bounds."""
+    near, n = 0.3, 300
+    A = rng.normal(size=(n, 3, 3))
+    A[:, 2, 2] = near + np.abs(A[:, 2, 2])
+    T, squares = np.array([[32.0, 0, 12], [0, 30.0, 9], [0, 0, 1]]) @ A, rng.uniform(1, 9, n)
+    is_cut = T[:, 2, 2] - np.sqrt(squares) * np.linalg.norm(T[:, 2, :2], axis=1) < near
+    T, e = T[is_cut], np.sqrt(squares[is_cut])
+    low, high = cut_disc_boxes(T, e * e, near)
+    n_wide = 0
+    for one, radius, left, right in zip(T, e, low, high, strict=True):
+        half = np.arccos((near - one[2, 2]) / (radius * np.hypot(*one[2, :2])))  # of the circle that is cut off
+        angles = np.arctan2(one[2, 1], one[2, 0]) + np.linspace(-half, half, 20_001)
+        points = np.vstack([radius * np.cos(angles), radius * np.sin(angles), np.ones_like(angles)])
+        u_v_z = one @ points
+        shown = u_v_z[:2] / u_v_z[2]
+        assert_allclose(u_v_z[2, [0, -1]], near, rtol=1e-9)
+        size = np.abs(np.stack([left, right])).max()
+        assert (shown.min(axis=1) >= left - 1e-9 * size).all() and (shown.max(axis=1) <= right + 1e-9 * size).all()
+        assert (shown.min(axis=1) <= left + 1e-4 * size).all() and (shown.max(axis=1) >= right - 1e-4 * size).all()
+        n_wide += (shown.max(axis=1) - shown.min(axis=1)).min() > 100
+    assert len(T) > 150 and n_wide > 20
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ class SurfelRules(NamedTuple):
     """Whether points before the near plane are not hit, those behind the camera among them."""
     tile_size: int
     """Side of the square tiles, px, to which gsplat extends the reach of a surfel of ``GSPLAT_CUTOFF``; 0: a surfel
-    reaches exactly as far as its alpha can be ``alpha_min``."""
+    reaches exactly as far as its alpha can be ``alpha_min``, where hits before the near plane are dropped."""
     low_pass_cutoff: float
     """e, standard deviations: the low-pass is around the middle of the box of the disc of this radius."""
 
@@ -295,12 +295,58 @@ def _visible_boxes(
     """Return the first and the end [N, 2] of the pixels on which alpha can be ``alpha_min``.
 
     Both forms of the hit reach the squared radius ``e^2 = 2 ln(o / alpha_min)``, the disc on itself, the low-pass in
-    the image. A disc that reaches behind the camera has no bounds: it gets the whole image.
+    the image. Of a disc that the near plane cuts, the part beyond it counts, since hits before it are dropped; a plane
+    at z = 0 bounds no part.
     """
     squares = 2 * np.log(np.maximum(opacities / conventions.alpha_min, 1))
-    middle, h2, d = disc_boxes(T, squares)
+    middle, h2, _ = disc_boxes(T, squares)
     h, low_pass = np.sqrt(np.maximum(h2, 0)), np.sqrt(squares / LOW_PASS)[:, None]
-    size, is_in_front = np.array([camera.width, camera.height]), (d < 0)[:, None]
-    low = np.where(is_in_front, np.minimum(middle - h, c - low_pass), 0)
-    high = np.where(is_in_front, np.maximum(middle + h, c + low_pass), size)
+    nearest = T[:, 2, 2] - np.sqrt(squares * np.sum(T[:, 2, :2] ** 2, axis=1))
+    is_cut, size = (nearest < conventions.near_plane)[:, None], np.array([camera.width, camera.height])
+    first, end = np.zeros_like(c), np.broadcast_to(size, c.shape)
+    if conventions.near_plane > 0:
+        first, end = (np.clip(bound, 0, size) for bound in cut_disc_boxes(T, squares, conventions.near_plane))
+    low = np.minimum(np.where(is_cut, first, middle - h), c - low_pass)
+    high = np.maximum(np.where(is_cut, end, middle + h), c + low_pass)
     return np.floor(low), np.ceil(high)
+
+
+def cut_disc_boxes(T: Floats, squares: Floats, near: float) -> tuple[Floats, Floats]:
+    """Return the bounds [N, 2] in the image of those parts of discs that a near plane leaves; px.
+
+    Where the part is widest along x or y, there is an end of the chord at z = near, or a point of the circle. At the
+    latter the line ``x = X`` touches the circle: ``l = M_u - X M_w`` has ``l_2^2 = e^2 (l_0^2 + l_1^2)``, that is::
+
+        d X^2 - 2 b X + a = 0,   d = sum(k M_w^2),  b = sum(k M_u M_w),  a = sum(k M_u^2)
+
+    and its z tells whether it is left. With M_v in place of M_u, y is bounded.
+
+    Parameters
+    ----------
+    T : ndarray of shape (N, 3, 3)
+    squares : ndarray of shape (N,)
+        e^2, squared radii.
+    near : float
+        Depth of the plane, world units; it cuts all these discs, and their centres lie beyond it.
+    """
+    M_w, k = T[:, None, 2], np.column_stack([squares, squares, -np.ones_like(squares)])
+    slope = np.linalg.norm(T[:, 2, :2], axis=1, keepdims=True)  # of z on the disc
+    uphill, distance = T[:, 2, :2] / slope, (near - T[:, 2, 2:]) / slope
+    half = np.sqrt(np.maximum(squares[:, None] - distance**2, 0))
+    along = np.column_stack([-uphill[:, 1], uphill[:, 0]])
+    ends = np.stack([distance * uphill + half * along, distance * uphill - half * along], axis=1)  # [N, 2, 2] (u, v)
+    bounds = (np.einsum("naj,nej->nea", T[:, :2, :2], ends) + T[:, None, :2, 2]) / near  # [N, 2 ends, 2 axes]
+
+    d = np.sum(k * T[:, 2] ** 2, axis=1, keepdims=True)
+    b, a = (
+        np.einsum("nj,naj,naj->na", k, T[:, :2], other) for other in (np.broadcast_to(M_w, T[:, :2].shape), T[:, :2])
+    )
+    discriminant = b * b - a * d
+    q = b + np.copysign(np.sqrt(np.where(discriminant < 0, np.nan, discriminant)), b)  # NaN: no line touches the disc
+    touches = np.stack([q / d, a / q], axis=1)  # [N, 2 roots, 2 axes] X
+    line = T[:, None, :2] - touches[..., None] * M_w[:, :, None]
+    foot = -line[..., 2:] * line[..., :2] / np.sum(line[..., :2] ** 2, axis=-1, keepdims=True)
+    is_left = np.einsum("nj,nraj->nra", T[:, 2, :2], foot) + T[:, 2, 2, None, None] >= near
+    low = np.minimum(bounds.min(axis=1), np.where(is_left, touches, np.inf).min(axis=1))
+    high = np.maximum(bounds.max(axis=1), np.where(is_left, touches, -np.inf).max(axis=1))
+    return low, high
