@@ -8,8 +8,9 @@ only sums over Gaussians have to exclude the copies.
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, gather, load, reduce_sum, select, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, gather, load, reduce_sum, scatter, select, store
 from minisplat_ref.jit.literals import ZERO
+from minisplat_ref.scalar.projection import dot
 from minisplat_ref.types import Floats
 
 DOUBLE = np.float64(0)  # names the dtype
@@ -81,15 +82,57 @@ def triple(table, rows):
 
 
 @scalar
+def quaternion(quats, rows):
+    """Return the quaternions wxyz of eight rows in float64."""
+    return (*triple(quats, rows), gather_wide(quats, rows, 3))
+
+
+@scalar
 def round_lanes(lanes, zero):
     """Return three lanes in the dtype of a number."""
     return cast(lanes[0], zero), cast(lanes[1], zero), cast(lanes[2], zero)
 
 
 @scalar
+def scatter_visible(is_drawn, table, rows, column, lanes):
+    """Write lanes to a column, with zeros where a Gaussian is culled."""
+    scatter(table, rows, column, select(is_drawn, lanes, ZERO))
+
+
+@scalar
+def scatter_triple(table, rows, lanes):
+    """Write the first three columns of eight rows."""
+    scatter(table, rows, 0, lanes[0])
+    scatter(table, rows, 1, lanes[1])
+    scatter(table, rows, 2, lanes[2])
+
+
+@scalar
+def clear_culled(radii, first, end, out):
+    """Write zeros to the culled Gaussians of a range of a ``PrimitiveGradient``."""
+    for n in range(first, end):
+        if radii[n, 0] == 0:
+            out.opacities[n] = ZERO
+            for i in range(3):
+                out.means[n, i] = ZERO
+                out.scales[n, i] = ZERO
+            for i in range(4):
+                out.quats[n, i] = ZERO
+
+
+@scalar
 def add(sums, k, is_counted, lanes):
     """Add lanes to the ``k``-th eight sums of a buffer."""
     store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))
+
+
+@scalar
+def add_pose_row(v_pose, first, is_counted, v_p, v_V, mean, M):
+    """Add to the gradient with respect to a row of R, and then of t: p = R x + t and V = R M."""
+    add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
+    add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
+    add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
+    add(v_pose, first + 3, is_counted, v_p)
 
 
 @scalar

@@ -16,17 +16,21 @@ import numpy as np
 from minisplat_ref.constants import COMPENSATION_FLOOR, JACOBIAN_CLAMP, Conventions
 from minisplat_ref.cpu.gaussian_rows import (
     DOUBLE,
-    add,
+    add_pose_row,
+    clear_culled,
     contiguous,
     eight_rows,
     gather_wide,
     list_visible,
     load_rows,
+    quaternion,
+    scatter_triple,
+    scatter_visible,
     sum_parts,
     triple,
 )
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, iota, scatter, select
+from minisplat_ref.jit.lanes import WIDTH, iota, scatter
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import Extent, inria_box, is_seen, support_box
 from minisplat_ref.scalar.projection import (
@@ -82,16 +86,11 @@ def pack_constants(camera: Camera, conventions: Conventions) -> ProjectionConsta
 
 
 @scalar
-def _quaternion(quats, rows):
-    return (*triple(quats, rows), gather_wide(quats, rows, 3))
-
-
-@scalar
 def _project_eight(rows, primitives, pose, constants, extent, out):
     R = matrix_rows(pose.R)
     x, y, z = triple(primitives.means, rows)
     p = to_camera(R, pose.centre, x, y, z)
-    M = axes(_quaternion(primitives.quats, rows), triple(primitives.scales, rows))
+    M = axes(quaternion(primitives.quats, rows), triple(primitives.scales, rows))
     footprint = project_gaussian(p, matmul3(R, M), constants)
     opacity = gather_wide(primitives.opacities, rows, 0) * footprint.compensation
     a, b, c = conic(footprint)
@@ -101,25 +100,19 @@ def _project_eight(rows, primitives, pose, constants, extent, out):
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, extent.width, extent.height)
     reach = rx, ry, x0, y0, x1, y1
     is_drawn = is_seen(p[2], opacity, footprint, (a, b, c), reach, extent.alpha_min, constants)
-    _scatter_visible(is_drawn, out.means2d, rows, 0, footprint.x)
-    _scatter_visible(is_drawn, out.means2d, rows, 1, footprint.y)
-    _scatter_visible(is_drawn, out.depths, rows, 0, p[2])
-    _scatter_visible(is_drawn, out.conics, rows, 0, a)
-    _scatter_visible(is_drawn, out.conics, rows, 1, b)
-    _scatter_visible(is_drawn, out.conics, rows, 2, c)
-    _scatter_visible(is_drawn, out.opacities, rows, 0, opacity)
-    _scatter_visible(is_drawn, out.radii, rows, 0, rx)
-    _scatter_visible(is_drawn, out.radii, rows, 1, ry)
-    _scatter_visible(is_drawn, out.boxes, rows, 0, x0)
-    _scatter_visible(is_drawn, out.boxes, rows, 1, y0)
-    _scatter_visible(is_drawn, out.boxes, rows, 2, x1)
-    _scatter_visible(is_drawn, out.boxes, rows, 3, y1)
-
-
-@scalar
-def _scatter_visible(is_drawn, table, rows, column, lanes):
-    """Write lanes to a column, with zeros where a Gaussian is culled."""
-    scatter(table, rows, column, select(is_drawn, lanes, ZERO))
+    scatter_visible(is_drawn, out.means2d, rows, 0, footprint.x)
+    scatter_visible(is_drawn, out.means2d, rows, 1, footprint.y)
+    scatter_visible(is_drawn, out.depths, rows, 0, p[2])
+    scatter_visible(is_drawn, out.conics, rows, 0, a)
+    scatter_visible(is_drawn, out.conics, rows, 1, b)
+    scatter_visible(is_drawn, out.conics, rows, 2, c)
+    scatter_visible(is_drawn, out.opacities, rows, 0, opacity)
+    scatter_visible(is_drawn, out.radii, rows, 0, rx)
+    scatter_visible(is_drawn, out.radii, rows, 1, ry)
+    scatter_visible(is_drawn, out.boxes, rows, 0, x0)
+    scatter_visible(is_drawn, out.boxes, rows, 1, y0)
+    scatter_visible(is_drawn, out.boxes, rows, 2, x1)
+    scatter_visible(is_drawn, out.boxes, rows, 3, y1)
 
 
 @kernel()
@@ -160,7 +153,7 @@ def _project_eight_vjp(rows, is_counted, primitives, pose, constants, v, out, v_
     R, centre = pose
     x, y, z = triple(primitives.means, rows)
     p = to_camera(R, centre, x, y, z)
-    quat, scale = _quaternion(primitives.quats, rows), triple(primitives.scales, rows)
+    quat, scale = quaternion(primitives.quats, rows), triple(primitives.scales, rows)
     M = axes(quat, scale)
     V = matmul3(R, M)
     footprint = project_gaussian(p, V, constants)
@@ -172,44 +165,21 @@ def _project_eight_vjp(rows, is_counted, primitives, pose, constants, v, out, v_
     v_p, v_V = project_gaussian_vjp(p, V, constants, footprint, v_x, v_y, v_z, v_cov)
     R_transposed = transpose3(R)
     v_quat, v_scale = axes_vjp(quat, scale, matmul3(R_transposed, v_V))
-    _scatter_triple(out.means, rows, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
-    _scatter_triple(out.scales, rows, v_scale)
-    _scatter_triple(out.quats, rows, v_quat)
+    scatter_triple(out.means, rows, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
+    scatter_triple(out.scales, rows, v_scale)
+    scatter_triple(out.quats, rows, v_quat)
     scatter(out.quats, rows, 3, v_quat[3])
     scatter(out.opacities, rows, 0, v_opacity * footprint.compensation)
-    _add_row(v_pose, 0, is_counted, v_p[0], v_V[0], (x, y, z), M)
-    _add_row(v_pose, 4, is_counted, v_p[1], v_V[1], (x, y, z), M)
-    _add_row(v_pose, 8, is_counted, v_p[2], v_V[2], (x, y, z), M)
-
-
-@scalar
-def _scatter_triple(table, rows, lanes):
-    scatter(table, rows, 0, lanes[0])
-    scatter(table, rows, 1, lanes[1])
-    scatter(table, rows, 2, lanes[2])
-
-
-@scalar
-def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
-    """Add to the gradient with respect to a row of R, and then of t: p = R x + t and V = R M."""
-    add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
-    add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
-    add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
-    add(v_pose, first + 3, is_counted, v_p)
+    add_pose_row(v_pose, 0, is_counted, v_p[0], v_V[0], (x, y, z), M)
+    add_pose_row(v_pose, 4, is_counted, v_p[1], v_V[1], (x, y, z), M)
+    add_pose_row(v_pose, 8, is_counted, v_p[2], v_V[2], (x, y, z), M)
 
 
 @scalar
 def _project_chunk_vjp(chunk, primitives, radii, pose, constants, v, out, v_poses):
     n_chunks, n_gaussians = v_poses.shape[0], radii.shape[0]
     first, end = n_gaussians * chunk // n_chunks, n_gaussians * (chunk + 1) // n_chunks
-    for n in range(first, end):
-        if radii[n, 0] == 0:
-            out.opacities[n] = ZERO
-            for i in range(3):
-                out.means[n, i] = ZERO
-                out.scales[n, i] = ZERO
-            for i in range(4):
-                out.quats[n, i] = ZERO
+    clear_culled(radii, first, end, out)
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(radii, first, end, visible)
     in_rows = Pose(matrix_rows(pose.R), pose.centre)  # read once

@@ -74,6 +74,12 @@ def dot(a, b):
 
 
 @scalar
+def cross(a, b):
+    """Return the vector product of two triples."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@scalar
 def matrix_rows(matrix):
     """Return the rows of a 3 x 3 array as a tuple."""
     return (
@@ -142,7 +148,7 @@ def project_gaussian(p, V, constants):
     cov_xx = dot(u, u)
     cov_xy = dot(u, w)
     cov_yy = dot(w, w)
-    area = (u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0])
+    area = cross(u, w)
     det_sharp = dot(area, area)
     det = det_sharp + constants.eps2d * (cov_xx + cov_yy) + constants.eps2d * constants.eps2d
     compensation = ZERO * det + ONE  # NaN where det is not finite

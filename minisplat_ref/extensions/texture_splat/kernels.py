@@ -33,8 +33,9 @@ from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, accumulate, gather, load, reduce_any, reduce_sum, select, store
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
-from minisplat_ref.mechanisms.surfels.kernels import U, V, W, response_for
+from minisplat_ref.mechanisms.surfels.kernels import response_for
 from minisplat_ref.mechanisms.surfels.projection import Surfels
+from minisplat_ref.mechanisms.surfels.record_kernels import U, V, W
 from minisplat_ref.mechanisms.surfels.response import Layout
 from minisplat_ref.scalar.compositing import blend, blend_vjp
 from minisplat_ref.types import Floats, TileBins

@@ -41,7 +41,7 @@ from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.mechanisms.surfels import renderer as discs
-from minisplat_ref.mechanisms.surfels.projection import SurfelGradient, centers_moved, project_vjp
+from minisplat_ref.mechanisms.surfels.projection import SurfelGradient, centers_moved
 from minisplat_ref.reference.pinhole import pose, with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, choose_degree, parameters_vjp
 from minisplat_ref.training.sky import unit_rays
@@ -323,7 +323,7 @@ def _parameters_vjp(
     all_normals = v.normals.copy()
     all_normals[rows] += v_normals
     v = v._replace(normals=all_normals)
-    v_primitives = project_vjp(tape.seen.primitives, tape.seen.camera, tape.request.conventions, tape.seen.surfels, v)
+    v_primitives = discs.look_vjp(tape.seen, tape.request.conventions, tape.request.backend, v)
     v_means = v_sh.means.copy()
     v_means[rows] += v_x @ tape.sight.R
     v_R = v_R + v_x.T @ g.means[rows] + v_sh.cam_from_world_R

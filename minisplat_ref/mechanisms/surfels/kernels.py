@@ -5,8 +5,8 @@ intersected with two planes for each pixel::
 
     (u, v, 1) / z = T^-1 (x, y, 1)^T
 
-These are three linear functions of the pixel, U, V and W, and the depth of the hit is z = 1 / W. They are stored by
-their values at a pixel near the centre and their slopes, so that differences of large numbers are taken in float64.
+These are three linear functions of the pixel, U, V and W, and the depth of the hit is z = 1 / W.
+:mod:`.record_kernels` computes them.
 """
 
 import functools
@@ -20,16 +20,27 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import load, minimum, select
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.mechanisms.surfels.projection import LOW_PASS, Surfels
+from minisplat_ref.mechanisms.surfels.record_kernels import (
+    CENTER_X,
+    CENTER_Y,
+    DEPTH,
+    N_GRADIENTS,
+    NEAR,
+    OPACITY,
+    PIVOT,
+    REF_X,
+    REF_Y,
+    U,
+    V,
+    W,
+    records_of,
+    records_of_vjp,
+)
 from minisplat_ref.mechanisms.surfels.response import Layout
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import Ints
 
-# Columns of a record; those before REF_X have a derivative.
-U, V, W, CENTER_X, CENTER_Y, OPACITY, DEPTH = 0, 3, 6, 9, 10, 11, 12
-N_GRADIENTS = DEPTH + 1
-REF_X, REF_Y, NEAR, PIVOT, SIZE = range(N_GRADIENTS, N_GRADIENTS + 5)
 _LOW_PASS = np.float32(LOW_PASS)
 _RHO_MAX = np.float32(1e30)  # of a disc that the ray does not meet
-PLANE_MAX = 1e12  # largest entry of T^-1: discs seen more edge-on than that are their low-pass alone
 
 
 @functools.cache
@@ -131,7 +142,7 @@ def _surfel_response(exp: Callable, layout: tuple[int, int], has_hit_depths: boo
 
     shade, shade_vjp = depth_shades(layout)
     return KernelResponse(
-        _records, _records_vjp, _boxes, hit, hit_vjp, N_GRADIENTS, shade, shade_vjp, n_coefficients=1, n_places=1
+        records_of, records_of_vjp, _boxes, hit, hit_vjp, N_GRADIENTS, shade, shade_vjp, n_coefficients=1, n_places=1
     )
 
 
@@ -139,55 +150,6 @@ def response_for(dtype: np.dtype, surfels: Surfels, layout: Layout) -> KernelRes
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     rules = surfels.rules
     return _surfel_response(choose_exponential(dtype), channels_of(layout), rules.has_hit_depths, rules.drops_near_hits)
-
-
-def _planes(surfels: Surfels) -> tuple[Floats, Floats]:
-    """Return pixels r near the centres [N, 2], and the inverses [N, 3, 3] of T with its rows moved by r.
-
-    The inverse is the matrix of cofactors over the determinant; it is 0 where a disc is seen from its edge, which then
-    is met nowhere.
-    """
-    r = np.clip(np.rint(surfels.means2d), -1e9, 1e9)
-    moved = _moved(surfels.transforms, r)
-    M_u, M_v, M_w = moved[:, 0], moved[:, 1], moved[:, 2]
-    cofactors = np.stack([np.cross(M_v, M_w), np.cross(M_w, M_u), np.cross(M_u, M_v)], axis=2)
-    det = np.sum(M_u * np.cross(M_v, M_w), axis=1)[:, None, None]
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        planes = cofactors / det
-        return r, np.where((np.abs(planes) < PLANE_MAX).all(axis=(1, 2), keepdims=True), planes, 0)
-
-
-def _moved(T: Floats, r: Floats) -> Floats:
-    """Return T of pixels relative to r: ``M_u - r_x M_w, M_v - r_y M_w, M_w``."""
-    return np.concatenate([T[:, :2] - r[:, :, None] * T[:, 2:], T[:, 2:]], axis=1)
-
-
-def _records(surfels: Surfels, dtype: np.dtype) -> Floats:
-    r, planes = _planes(surfels)
-    records = np.empty((len(r), SIZE), dtype)
-    records[:, :CENTER_X] = planes.reshape(-1, 9)
-    records[:, CENTER_X : CENTER_Y + 1] = surfels.means2d - r
-    records[:, OPACITY], records[:, DEPTH] = surfels.opacities, surfels.depths  # of the centres
-    records[:, REF_X : REF_Y + 1], records[:, NEAR], records[:, PIVOT] = r, surfels.near_plane, surfels.pivot
-    return records
-
-
-def _records_vjp(surfels: Surfels, v_records: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Gradient with respect to transforms, means2d, opacities and depths.
-
-    With ``P = T'^-1``, ``dP = -P dT' P``::
-
-        v_T' = -P^T v_P P^T,   v_M_u = v_M'_u,   v_M_v = v_M'_v,   v_M_w = v_M'_w - r_x v_M'_u - r_y v_M'_v
-    """
-    r, planes = _planes(surfels)
-    inverse = np.swapaxes(planes, 1, 2)
-    v_T = -inverse @ v_records[:, :CENTER_X].reshape(-1, 3, 3) @ inverse
-    v_T[:, 2] -= np.einsum("nk,nkj->nj", r, v_T[:, :2])
-    v_depths = v_records[:, DEPTH]
-    if surfels.rules.has_hit_depths:  # then the depth of the centre is the corner of T
-        v_T[:, 2, 2] += v_depths
-        v_depths = np.zeros_like(v_depths)
-    return v_T, v_records[:, CENTER_X : CENTER_Y + 1], v_records[:, OPACITY], v_depths
 
 
 def _boxes(surfels: Surfels) -> Ints:

@@ -24,7 +24,7 @@ import numpy as np
 from minisplat_ref.constants import RADIUS_MAX, Conventions
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.pinhole import pose, with_principal_point
-from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives, Projection
+from minisplat_ref.types import Camera, Floats, Ints, PrimitiveGradient, Primitives
 
 LOW_PASS = 2.0  # px^-2: the low-pass is exp(-LOW_PASS |x - c|^2 / 2), a standard deviation of 0.71 pixels
 GSPLAT_CUTOFF = 3.33  # standard deviations to which gsplat renders a disc
@@ -77,12 +77,6 @@ class Surfels(NamedTuple):
     near_plane: float
     pivot: float
     """q_0, an inverse depth of the view; see :class:`minisplat_ref.mechanisms.surfels.response.Layout`."""
-
-    @property
-    def listed(self) -> Projection:
-        """A projection to make lists of tiles from; its ellipses fill the boxes."""
-        wide = np.tile((1e-12, 0.0, 1e-12), (len(self.depths), 1))
-        return Projection(self.means2d, self.depths, wide, np.ones_like(self.opacities), self.radii, self.boxes)
 
 
 class SurfelGradient(NamedTuple):

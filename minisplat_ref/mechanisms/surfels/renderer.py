@@ -8,15 +8,13 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
+from minisplat_ref.mechanisms.surfels import projection, projection_kernels, ray_kernels, ray_measures
 from minisplat_ref.mechanisms.surfels.kernels import response_for
 from minisplat_ref.mechanisms.surfels.projection import (
     RELEASED,
     SurfelGradient,
     Surfels,
     centers_moved,
-    project,
-    project_vjp,
 )
 from minisplat_ref.mechanisms.surfels.ray_measures import RayMeasures
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
@@ -32,16 +30,17 @@ from minisplat_ref.rendering import (
     parameters_vjp,
 )
 from minisplat_ref.rendering.backends import Backend
+from minisplat_ref.rendering.box_lists import list_boxes
 from minisplat_ref.types import (
     BlendGradient,
     Camera,
     Floats,
     Ints,
     Model,
+    PrimitiveGradient,
     Primitives,
     RenderOutput,
     TileBins,
-    TileGrid,
     View,
 )
 
@@ -103,8 +102,7 @@ class Shown(NamedTuple):
 
 def list_tiles(surfels: Surfels, camera: Camera, conventions: Conventions, backend: Backend) -> TileBins:
     """Return the surfels of every tile, nearest centres first."""
-    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
-    return backend.bin_gaussians(surfels.listed, grid, conventions)
+    return list_boxes(surfels.depths, surfels.radii, surfels.boxes, camera, conventions, backend)
 
 
 class Seen(NamedTuple):
@@ -170,12 +168,23 @@ def look(model: Model, view: View, request: Request, low_pass_cutoff: float = RE
         raise InputError(f"surfels are drawn without {names}: train a recipe that does without")
     if request.conventions.is_antialiased:
         raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
-    primitives, rules = (
-        activate(model.gaussians, request.is_visible),
-        RELEASED._replace(low_pass_cutoff=low_pass_cutoff),
-    )
-    surfels = project(primitives, view.camera, request.conventions, rules)
+    primitives = activate(model.gaussians, request.is_visible)
+    rules = RELEASED._replace(low_pass_cutoff=low_pass_cutoff)
+    surfels = _projection(request.backend).project(primitives, view.camera, request.conventions, rules)
     return Seen(model.gaussians, primitives, view.camera, surfels)
+
+
+def look_vjp(seen: Seen, conventions: Conventions, backend: Backend, v_surfels: SurfelGradient) -> PrimitiveGradient:
+    """Gradient of :func:`look` with respect to the activated surfels and the pose."""
+    gradient: PrimitiveGradient = _projection(backend).project_vjp(
+        seen.primitives, seen.camera, conventions, seen.surfels, v_surfels
+    )
+    return gradient
+
+
+def _projection(backend: Backend) -> Any:
+    """Return the module that projects: kernels or the reference."""
+    return projection_kernels if backend.is_compiled else projection
 
 
 def blend(seen: Seen, colors: Floats, carried: Floats, request: Request) -> tuple[RenderOutput, BlendTape]:
@@ -302,7 +311,7 @@ def render_surfels_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None
     """
     (g, primitives, camera, surfels), shown = tape.seen, tape.shown
     v = blend_vjp(tape.blend, v_image, v_alpha)
-    v_primitives = project_vjp(primitives, camera, shown.conventions, surfels, v.surfels)
+    v_primitives = look_vjp(tape.seen, shown.conventions, shown.backend, v.surfels)
     v_sh = shown.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, surfels.radii, v.colors)
     return RenderGradient(
         gaussians=parameters_vjp(g, primitives, v_primitives, v_sh),
