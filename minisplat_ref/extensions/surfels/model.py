@@ -3,9 +3,11 @@
 Population, renderer and losses are those of :mod:`minisplat_ref.mechanisms.surfels`.
 """
 
+from typing import Any
+
 import numpy as np
 
-from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.depth_maps import normal_kernels, normals
 from minisplat_ref.mechanisms.surfels.discs import DISC_EVENTS, DISCS
 from minisplat_ref.mechanisms.surfels.gradient_checks import rays_stage, renderer_stage
 from minisplat_ref.mechanisms.surfels.losses import LOSSES
@@ -20,13 +22,14 @@ RECIPE = GS_ACCEL._replace(name="surfels", losses=(*GS_ACCEL.losses, *LOSSES), e
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer with all its channels, rays, and normals from depths, which are NumPy on every backend."""
+    """Return the renderer with all its channels, rays, and normals from depths."""
+    module: Any = normal_kernels if backend.is_compiled else normals
     depth = rng.uniform(2, 3, size=(6, 7))
-    normals = Stage(
+    of_depths = Stage(
         "central_normals",
         {"depth": depth},
         ("normals",),
-        lambda z: Point((central_normals(z, setting.camera),)),
-        lambda v: (central_normals_vjp(depth, setting.camera, v),),
+        lambda z: Point((module.central_normals(z, setting.camera),)),
+        lambda v: (module.central_normals_vjp(depth, setting.camera, v),),
     )
-    return renderer_stage(backend, setting, DISCS, rng), rays_stage(backend, setting, rng), normals
+    return renderer_stage(backend, setting, DISCS, rng), rays_stage(backend, setting, rng), of_depths

@@ -8,11 +8,11 @@ neighbouring pixels' depths::
 The loss chooses the depths: expected, median or filtered.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.mechanisms.depth_maps.normals import central_normals, central_normals_vjp
+from minisplat_ref.mechanisms.depth_maps import normal_kernels, normals
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
 from minisplat_ref.training.losses import Cotangents, Rendered
 from minisplat_ref.types import Floats
@@ -39,10 +39,12 @@ def disagree(rendered: Rendered, depth: Floats) -> Disagreement:
     is_hit, has_normal = A > rendered.request.conventions.alpha_min / 2, np.zeros(A.shape, bool)
     has_normal[1:-1, 1:-1] = is_hit[2:, 1:-1] & is_hit[:-2, 1:-1] & is_hit[1:-1, 2:] & is_hit[1:-1, :-2]
     n = np.where(has_normal[..., None], rendered.channel("normal"), 0)
-    N, share = central_normals(depth, camera), A.dtype.type(1 / A.size)
+    surface: Any = normal_kernels if rendered.request.backend.is_compiled else normals
+    N, share = surface.central_normals(depth, camera), A.dtype.type(1 / A.size)
     value = float(share * np.sum(A - np.sum(n * N, axis=2), dtype=np.float64))
     v_normal = -share * np.where(has_normal[..., None], N, 0)
-    return Disagreement(value, v_normal, central_normals_vjp(depth, camera, -share * n), np.full_like(A, share))
+    v_depth = surface.central_normals_vjp(depth, camera, -share * n)
+    return Disagreement(value, v_normal, v_depth, np.full_like(A, share))
 
 
 def normal_consistency(rendered: Rendered) -> tuple[float, Cotangents]:
