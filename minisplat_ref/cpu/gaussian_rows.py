@@ -82,9 +82,25 @@ def triple(table, rows):
 
 
 @scalar
+def matrix(table, rows):
+    """Return the first nine columns of eight rows in float64, as a matrix."""
+    return (
+        (gather_wide(table, rows, 0), gather_wide(table, rows, 1), gather_wide(table, rows, 2)),
+        (gather_wide(table, rows, 3), gather_wide(table, rows, 4), gather_wide(table, rows, 5)),
+        (gather_wide(table, rows, 6), gather_wide(table, rows, 7), gather_wide(table, rows, 8)),
+    )
+
+
+@scalar
 def quaternion(quats, rows):
     """Return the quaternions wxyz of eight rows in float64."""
     return (*triple(quats, rows), gather_wide(quats, rows, 3))
+
+
+@scalar
+def zero_if_finite(a):
+    """Return 0 for three finite numbers, NaN otherwise."""
+    return ZERO * a[0] + ZERO * a[1] + ZERO * a[2]
 
 
 @scalar
@@ -97,6 +113,14 @@ def round_lanes(lanes, zero):
 def scatter_visible(is_drawn, table, rows, column, lanes):
     """Write lanes to a column, with zeros where a Gaussian is culled."""
     scatter(table, rows, column, select(is_drawn, lanes, ZERO))
+
+
+@scalar
+def scatter_visible_triple(is_drawn, table, rows, first, lanes):
+    """Write three columns from the first on, with zeros where a Gaussian is culled."""
+    scatter_visible(is_drawn, table, rows, first, lanes[0])
+    scatter_visible(is_drawn, table, rows, first + 1, lanes[1])
+    scatter_visible(is_drawn, table, rows, first + 2, lanes[2])
 
 
 @scalar

@@ -8,16 +8,10 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.cameras import footprint_kernels, ray_footprints
 from minisplat_ref.mechanisms.cameras.kernels import response_for
 from minisplat_ref.mechanisms.cameras.models import are_inside
-from minisplat_ref.mechanisms.cameras.ray_footprints import (
-    RESPONSE,
-    FootprintGradient,
-    LensFootprints,
-    list_tiles,
-    project,
-    project_vjp,
-)
+from minisplat_ref.mechanisms.cameras.ray_footprints import RESPONSE, FootprintGradient, LensFootprints, list_tiles
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.models import Drawn, hit_sides, model_stage
 from minisplat_ref.oracle.setting import Setting
@@ -68,13 +62,18 @@ class _Tape(NamedTuple):
     output: RenderOutput
 
 
+def _projection(backend: Backend) -> Any:
+    """Return the module that projects: kernels or the reference."""
+    return footprint_kernels if backend.is_compiled else ray_footprints
+
+
 def prepare(model: Model, camera: Camera, request: Request) -> Prepared:
     """Project and shade the Gaussians of a model."""
     g, dtype = model.gaussians, model.gaussians.means.dtype
     degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
     primitives = activate(g, request.is_visible)
-    footprints = project(primitives, camera, request.conventions)
+    footprints = _projection(request.backend).project(primitives, camera, request.conventions)
     channels = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, footprints.radii)
     has_depth = "depth" in request.wants
     if has_depth:
@@ -149,7 +148,7 @@ def render_through_lens_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None
         v_background = v.background[:-1]
     v_positions, v_whitenings, v_opacities = v.primitives
     v_footprints = FootprintGradient(v_positions, v_whitenings, v_opacities, v_depths)
-    v_primitives, v_means2d = project_vjp(p.primitives, footprints, v_footprints)
+    v_primitives, v_means2d = _projection(p.backend).project_vjp(p.primitives, footprints, v_footprints)
     v_sh = p.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, p.camera, p.sh_degree, footprints.radii, v_colors)
     return RenderGradient(
         gaussians=parameters_vjp(g, p.primitives, v_primitives, v_sh),

@@ -20,11 +20,18 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.mechanisms.cameras.ray_footprints import LensFootprints, boxes_of
+from minisplat_ref.mechanisms.cameras.record_kernels import (
+    AHEAD,
+    DEPTH,
+    N_GRADIENTS,
+    NORMAL,
+    OPACITY,
+    WHITE,
+    records_of,
+    records_of_vjp,
+)
 from minisplat_ref.types import Floats
 
-# Columns of a record, and of its gradient.
-OPACITY, NORMAL, WHITE, AHEAD, DEPTH, SIZE = 0, 1, 4, 13, 16, 17
-V_OPACITY, V_WHITE_MEAN, V_WHITE, N_GRADIENTS = 0, 1, 4, 13
 _TINY = np.float32(1e-30)  # of a . a where a Gaussian is culled
 
 
@@ -61,38 +68,12 @@ def lens_response(exp: Callable) -> KernelResponse:
         of_shape = q0 * x, q0 * y, q0 * z, q1 * x, q1 * y, q1 * z, q2 * x, q2 * y, q2 * z
         return (falloff * v_shape, m * p0, m * p1, m * p2) + of_shape  # noqa: RUF005  (Numba unpacks no tuple here)
 
-    return KernelResponse(_records, _records_vjp, boxes_of, hit, hit_vjp, N_GRADIENTS, rays=_rays)
+    return KernelResponse(records_of, records_of_vjp, boxes_of, hit, hit_vjp, N_GRADIENTS, rays=_rays)
 
 
 def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     return lens_response(choose_exponential(dtype))
-
-
-def _distances(footprints: LensFootprints) -> Floats:
-    """Return r [N, 1]; 1 where culled."""
-    r = np.linalg.norm(footprints.positions, axis=1, keepdims=True)
-    return np.where(r > 0, r, 1)
-
-
-def _records(footprints: LensFootprints, dtype: np.dtype) -> Floats:
-    r = _distances(footprints)
-    normals = (footprints.positions / r).astype(dtype)
-    G = (footprints.whitenings * r[:, :, None]).reshape(-1, 9).astype(dtype)
-    records = np.empty((len(r), SIZE), dtype)
-    records[:, OPACITY], records[:, DEPTH] = footprints.opacities, footprints.depths
-    records[:, NORMAL:WHITE], records[:, WHITE:AHEAD] = normals, G
-    # h of the rounded direction: the ray passes exactly where e says that it differs from it.
-    wide = footprints.whitenings * r[:, :, None]
-    records[:, AHEAD:DEPTH] = np.einsum("nij,nj->ni", wide, normals.astype(np.float64))
-    return records
-
-
-def _records_vjp(footprints: LensFootprints, v_records: Floats) -> tuple[Floats, Floats, Floats]:
-    """Gradient with respect to positions, whitenings and opacities: ``v_x = M^T sum q p``, ``v_M = r sum ...``."""
-    v_positions = np.einsum("nij,ni->nj", footprints.whitenings, v_records[:, V_WHITE_MEAN:V_WHITE])
-    v_whitenings = v_records[:, V_WHITE:].reshape(-1, 3, 3) * _distances(footprints)[:, :, None]
-    return v_positions, v_whitenings, v_records[:, V_OPACITY]
 
 
 def _rays(footprints: LensFootprints, dtype: np.dtype) -> Floats:

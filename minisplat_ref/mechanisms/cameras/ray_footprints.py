@@ -98,10 +98,7 @@ def project(primitives: Primitives, camera: Camera, conventions: Conventions) ->
     InputError
         The camera has parallel rays, its lens folds inside the image, or the conventions compensate opacities.
     """
-    if conventions.is_antialiased:
-        raise InputError("rays through lenses have no compensated opacities: leave the antialiased profile out")
-    if camera.optics is not None and camera.optics.model == "orthographic":
-        raise InputError("parallel rays are drawn exactly by the affine camera: take mechanisms.cameras.affine")
+    check_camera(camera, conventions)
     camera = with_principal_point(camera, conventions)
     model, rays = model_of(camera), ray_table(camera)
     means, quats, scales, opacities = (field.astype(np.float64) for field in primitives)
@@ -135,6 +132,20 @@ def project(primitives: Primitives, camera: Camera, conventions: Conventions) ->
         rays=rays,
         camera=camera,
     )
+
+
+def check_camera(camera: Camera, conventions: Conventions) -> None:
+    """Refuse parallel rays, and conventions that compensate opacities.
+
+    Raises
+    ------
+    InputError
+        Either of both.
+    """
+    if conventions.is_antialiased:
+        raise InputError("rays through lenses have no compensated opacities: leave the antialiased profile out")
+    if camera.optics is not None and camera.optics.model == "orthographic":
+        raise InputError("parallel rays are drawn exactly by the affine camera: take mechanisms.cameras.affine")
 
 
 def are_reached(x: Floats, scales: Floats, ratios: Floats, rays: Floats) -> Bools:

@@ -19,11 +19,14 @@ from minisplat_ref.cpu.gaussian_rows import (
     gather_wide,
     list_visible,
     load_rows,
+    matrix,
     quaternion,
     scatter_triple,
     scatter_visible,
+    scatter_visible_triple,
     sum_parts,
     triple,
+    zero_if_finite,
 )
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -162,19 +165,6 @@ def _reach_of_tiles(low_pass, frame):
 
 
 @scalar
-def _vanish(a):
-    """Return 0 for three finite numbers, NaN otherwise."""
-    return ZERO * a[0] + ZERO * a[1] + ZERO * a[2]
-
-
-@scalar
-def _scatter_visible_triple(is_drawn, table, rows, first, lanes):
-    scatter_visible(is_drawn, table, rows, first, lanes[0])
-    scatter_visible(is_drawn, table, rows, first + 1, lanes[1])
-    scatter_visible(is_drawn, table, rows, first + 2, lanes[2])
-
-
-@scalar
 def _project_eight(rows, primitives, frame, out):
     _, _, _, _, V, x, T = _see(rows, primitives, frame)
     opacity = gather_wide(primitives.opacities, rows, 0)
@@ -186,21 +176,21 @@ def _project_eight(rows, primitives, frame, out):
     x0, x1, y0, y1 = _clip(x0, frame.width), _clip(x1, frame.width), _clip(y0, frame.height), _clip(y1, frame.height)
     side = side_of((V[0][2], V[1][2], V[2][2]), x)
     normal = side * V[0][2], side * V[1][2], side * V[2][2]
-    nothing = _vanish(T[0]) + _vanish(T[1]) + _vanish(T[2]) + _vanish(normal)
-    nothing = nothing + _vanish((low_pass.x, low_pass.y, opacity)) + _vanish((r_x, r_y, low_pass.d))
+    finite = zero_if_finite(T[0]) + zero_if_finite(T[1]) + zero_if_finite(T[2]) + zero_if_finite(normal)
+    finite = finite + zero_if_finite((low_pass.x, low_pass.y, opacity)) + zero_if_finite((r_x, r_y, low_pass.d))
     is_between = (frame.near < x[2]) & (x[2] < frame.far)
-    is_drawn = is_between & is_reached & (nothing >= ZERO) & (abs(low_pass.d) > ZERO) & (x0 < x1) & (y0 < y1)
-    _scatter_visible_triple(is_drawn, out.transforms, rows, 0, T[0])
-    _scatter_visible_triple(is_drawn, out.transforms, rows, 3, T[1])
-    _scatter_visible_triple(is_drawn, out.transforms, rows, 6, T[2])
-    _scatter_visible_triple(is_drawn, out.normals, rows, 0, normal)
+    is_drawn = is_between & is_reached & (finite >= ZERO) & (abs(low_pass.d) > ZERO) & (x0 < x1) & (y0 < y1)
+    scatter_visible_triple(is_drawn, out.transforms, rows, 0, T[0])
+    scatter_visible_triple(is_drawn, out.transforms, rows, 3, T[1])
+    scatter_visible_triple(is_drawn, out.transforms, rows, 6, T[2])
+    scatter_visible_triple(is_drawn, out.normals, rows, 0, normal)
     scatter_visible(is_drawn, out.means2d, rows, 0, low_pass.x)
     scatter_visible(is_drawn, out.means2d, rows, 1, low_pass.y)
     scatter_visible(is_drawn, out.opacities, rows, 0, opacity)
     scatter_visible(is_drawn, out.depths, rows, 0, x[2])
     scatter_visible(is_drawn, out.radii, rows, 0, minimum(r_x, RADIUS_MAX))
     scatter_visible(is_drawn, out.radii, rows, 1, minimum(r_y, RADIUS_MAX))
-    _scatter_visible_triple(is_drawn, out.boxes, rows, 0, (x0, y0, x1))
+    scatter_visible_triple(is_drawn, out.boxes, rows, 0, (x0, y0, x1))
     scatter_visible(is_drawn, out.boxes, rows, 3, y1)
 
 
@@ -236,11 +226,8 @@ def _project_eight_vjp(rows, is_counted, primitives, frame, v, out, v_pose):
     square = low_pass_square(T, frame.low_pass_square, frame.tile_size > ZERO)
     v_c_x, v_c_y = gather_wide(v.means2d, rows, 0), gather_wide(v.means2d, rows, 1)
     of_center = disc_center_vjp(T, square, disc_box(T, square), v_c_x, v_c_y)
-    v_T = (
-        add_triples(_triple_from(v.transforms, rows, 0), of_center[0]),
-        add_triples(_triple_from(v.transforms, rows, 3), of_center[1]),
-        add_triples(_triple_from(v.transforms, rows, 6), of_center[2]),
-    )
+    v_u, v_v, v_w = matrix(v.transforms, rows)
+    v_T = add_triples(v_u, of_center[0]), add_triples(v_v, of_center[1]), add_triples(v_w, of_center[2])
     v_A = image_map_vjp(frame, v_T)
     v_x = v_A[0][2], v_A[1][2], v_A[2][2] + gather_wide(v.depths, rows, 0)
     v_n, side = triple(v.normals, rows), side_of((V[0][2], V[1][2], V[2][2]), x)
@@ -259,11 +246,6 @@ def _project_eight_vjp(rows, is_counted, primitives, frame, v, out, v_pose):
     add_pose_row(v_pose, 0, is_counted, v_x[0], v_V[0], mean, M)
     add_pose_row(v_pose, 4, is_counted, v_x[1], v_V[1], mean, M)
     add_pose_row(v_pose, 8, is_counted, v_x[2], v_V[2], mean, M)
-
-
-@scalar
-def _triple_from(table, rows, first):
-    return gather_wide(table, rows, first), gather_wide(table, rows, first + 1), gather_wide(table, rows, first + 2)
 
 
 @scalar

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.gaussian_rows import contiguous, eight_rows, gather_wide
+from minisplat_ref.cpu.gaussian_rows import contiguous, eight_rows, gather_wide, matrix
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, maximum, minimum, rint, scatter, select
 from minisplat_ref.jit.literals import ZERO
@@ -35,16 +35,6 @@ class _Fields(NamedTuple):
 
 
 @scalar
-def _read_matrix(table, rows):
-    """Return the first nine columns of eight rows as a matrix."""
-    return (
-        (gather_wide(table, rows, 0), gather_wide(table, rows, 1), gather_wide(table, rows, 2)),
-        (gather_wide(table, rows, 3), gather_wide(table, rows, 4), gather_wide(table, rows, 5)),
-        (gather_wide(table, rows, 6), gather_wide(table, rows, 7), gather_wide(table, rows, 8)),
-    )
-
-
-@scalar
 def _pixel_near(means2d, rows):
     """Return r."""
     x, y = rint(gather_wide(means2d, rows, 0)), rint(gather_wide(means2d, rows, 1))
@@ -64,7 +54,7 @@ def _keep(condition, row):
 @scalar
 def _planes(fields, rows, x, y):
     """Return P at (x, y); 0 where a disc is seen from its edge, which then is met nowhere."""
-    P = invert(move_map(_read_matrix(fields.transforms, rows), x, y))
+    P = invert(move_map(matrix(fields.transforms, rows), x, y))
     is_open = _is_moderate(P[0]) & _is_moderate(P[1]) & _is_moderate(P[2])
     return _keep(is_open, P[0]), _keep(is_open, P[1]), _keep(is_open, P[2])
 
@@ -106,7 +96,7 @@ def _pack_fields(surfels: Surfels) -> _Fields:
 @scalar
 def _write_eight_vjp(rows, fields, v_records, has_hit_depths, out):
     x, y = _pixel_near(fields.means2d, rows)
-    v_P = _read_matrix(v_records, rows)
+    v_P = matrix(v_records, rows)
     v_T = move_map_vjp(x, y, invert_vjp(_planes(fields, rows, x, y), v_P))
     v_depth = gather_wide(v_records, rows, DEPTH)
     v_corner, v_center = v_T[2][2], v_depth
