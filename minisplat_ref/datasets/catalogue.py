@@ -4,8 +4,11 @@ Each set lies in a public repository and is named by its commit, so that its fil
 has the hash of every file at that commit. One scene of the measured pages is missing, banana_blender, which was cut out
 of banana with hand-made masks; of buddha there are the 13 photographs that were measured.
 
-Photographs become scenes by ``sfm`` with the options given here: of those that are trained, photographs three times as
-large as the measured ones, which ``train --downscale 3`` then brings to their size, less the edge that is lost where a
+*lego* and *fern* are scenes already, with the cameras with which others have published their figures
+(``docs/measured/published.md``).
+
+Other photographs become scenes by ``sfm`` with the options given here: of those that are trained, photographs three
+times as large as the measured ones, which ``train --downscale 3`` then brings to their size, less the edge that is lost where a
 lens is straightened. The measured scenes were made in the same way from photographs of up to 1,600 pixels, so that
 cameras, and with them the figures, differ a little. The photographs of lund and buddha were compressed once more before
 they were measured.
@@ -43,11 +46,13 @@ class DataSet(NamedTuple):
     commit: str
     licence: str
     licence_file: str
-    """In the repository; it is fetched as well."""
+    """In the repository; it is fetched as well. Empty where there is none, and the licence is stated elsewhere."""
     next_command: tuple[str, ...]
     """The command that makes the measured scene of it; ``{}`` is the folder of the set."""
     folder: str = PHOTOS
     """The folder of its other files."""
+    root: str = ""
+    """Folder of the repository whose folders are kept; empty: all files come to lie in one."""
 
     @property
     def page(self) -> str:
@@ -57,6 +62,10 @@ class DataSet(NamedTuple):
 
 def _sfm(long_side: int, *options: str) -> tuple[str, ...]:
     return ("sfm", f"{{}}/{PHOTOS}", "--out", "{}/scene", "--long-side", str(long_side), *options)
+
+
+def _published(*options: str) -> tuple[str, ...]:
+    return ("train", "{}", "--recipe", "3dgs", *options, "--out", "{}/run")
 
 
 CATALOGUE = {
@@ -117,6 +126,26 @@ CATALOGUE = {
         ("bench", "--data", "{}/test_garden.npz", "--repeats", "7", "--out", "bench"),
         folder="",
     ),
+    "lego": DataSet(
+        "300 images of a rendered model of NeRF-Synthetic, 800 x 800, 200 of them for tests",
+        "luo-ziyuan/CopyRNeRF-code",
+        "454f028b606be4eb69c629aa4019b501504fb12b",
+        "CC BY-NC, of the model by Heinzelnisse, Blend Swap 11490: for measuring, not for commerce",
+        "",
+        _published("--background", "255,255,255"),
+        folder="",
+        root="data/nerf_synthetic/lego",
+    ),
+    "fern": DataSet(
+        "20 photographs of a fern, 1008 x 756, with the poses of LLFF",
+        "luo-ziyuan/CopyRNeRF-code",
+        "454f028b606be4eb69c629aa4019b501504fb12b",
+        "none stated; published for research with LLFF and NeRF",
+        "",
+        _published(),
+        folder="",
+        root="data/nerf_llff_data/fern",
+    ),
 }
 
 
@@ -143,7 +172,15 @@ def scene_files(name: str) -> list[File]:
         sha256, n_bytes, owner, path = line.split(" ")
         if owner == name:
             url = f"{HOST}/{data_set.repository}/{data_set.commit}/{path}"
-            folder = "" if path == data_set.licence_file else data_set.folder
-            # The last part alone: whatever the path is, the file comes to lie in the folder.
-            found.append(File(url, str(PurePosixPath(folder, PurePosixPath(path).name)), int(n_bytes), sha256))
+            found.append(File(url, _place(data_set, path), int(n_bytes), sha256))
     return found
+
+
+def _place(data_set: DataSet, path: str) -> str:
+    """Return where a file of the repository comes to lie: inside the folder of the set, whatever its path is."""
+    given = PurePosixPath(path)
+    if path == data_set.licence_file:
+        return given.name
+    if data_set.root and given.is_relative_to(data_set.root) and ".." not in given.parts:
+        return str(PurePosixPath(data_set.folder, given.relative_to(data_set.root)))
+    return str(PurePosixPath(data_set.folder, given.name))

@@ -196,6 +196,23 @@ def test_a_path_that_leaves_the_folder_does_not(server, tmp_path):
     assert [file.path for file in scene_files("small")] == ["photos/passwd"]
 
 
+def test_folders_of_a_set_are_kept_below_its_root_alone(server, tmp_path, monkeypatch):
+    """``test/r_0.png`` is another file than ``train/r_0.png``; what lies beside the root has its name alone."""
+    kept = catalogue.CATALOGUE["small"]._replace(folder="", root="data/set")
+    monkeypatch.setitem(catalogue.CATALOGUE, "small", kept)
+    names = (
+        "LICENSE",
+        "data/set/test/r_0.png",
+        "data/set/train/r_0.png",
+        "data/setting/x/r_1.png",
+        "data/set/../../r_2",
+    )
+    lines = [f"{'0' * 64} 4 small {name}" for name in names]
+    (tmp_path / "package" / "catalogue.sha256").write_text("\n".join(["# heading", *lines]))
+    places = ["LICENSE", "test/r_0.png", "train/r_0.png", "r_1.png", "r_2"]
+    assert [file.path for file in scene_files("small")] == places
+
+
 def test_the_list_has_every_set_its_size_its_licence_and_its_place(capsys):
     assert main(["data"]) == 0
     printed = capsys.readouterr().out
@@ -209,13 +226,13 @@ def test_the_list_has_every_set_its_size_its_licence_and_its_place(capsys):
 def test_every_set_is_whole(name):
     """The licence comes first; hashes are of 64 digits, commits of 40, and no two files share a place."""
     data_set, listed = CATALOGUE[name], scene_files(name)
-    assert listed[0].path == data_set.licence_file
+    assert listed[0].path == data_set.licence_file or not data_set.licence_file
     assert len(data_set.commit) == 40 and int(data_set.commit, 16)
     assert all(len(file.sha256) == 64 and int(file.sha256, 16) and file.n_bytes > 0 for file in listed)
     paths = [PurePosixPath(file.path) for file in listed]
     assert len(set(paths)) == len(paths) and not any(path.is_absolute() or ".." in path.parts for path in paths)
-    n_photographs = sum(path.parent.name == "photos" for path in paths)
-    n_files = {"garden": 2}.get(name, n_photographs + 1)
+    n_photographs = sum(path.suffix.lower() in (".jpg", ".png") for path in paths)
+    n_files = {"garden": 2, "lego": n_photographs + 2}.get(name, n_photographs + 1)
     assert len(listed) == n_files
     if n_photographs:
         assert data_set.what.startswith(f"{n_photographs} ")

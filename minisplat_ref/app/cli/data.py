@@ -55,7 +55,7 @@ def _fetch(name: str, out: Path) -> int:
     n_fetched = fetch(files, out, name)
     there = f", {len(files) - n_fetched} were there" if n_fetched < len(files) else ""
     print(f"{out}: {n_fetched} files fetched{there}; all {len(files)} have the right hash")
-    print(f"licence: {data_set.licence} ({out / data_set.licence_file})")
+    print(f"licence: {data_set.licence}" + (f" ({out / data_set.licence_file})" if data_set.licence_file else ""))
     words = (Path(word.format(out)) if "{}" in word else word for word in data_set.next_command)
     print(f"next: {command(*words)}")
     return 0
