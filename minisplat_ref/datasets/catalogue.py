@@ -8,10 +8,10 @@ of banana with hand-made masks; of buddha there are the 13 photographs that were
 (``docs/measured/published.md``).
 
 Other photographs become scenes by ``sfm`` with the options given here: of those that are trained, photographs three
-times as large as the measured ones, which ``train --downscale 3`` then brings to their size, less the edge that is lost where a
-lens is straightened. The measured scenes were made in the same way from photographs of up to 1,600 pixels, so that
-cameras, and with them the figures, differ a little. The photographs of lund and buddha were compressed once more before
-they were measured.
+times as large as the measured ones, which ``train --downscale 3`` then brings to their size, less the edge that is lost
+where a lens is straightened. The measured scenes were made in the same way from photographs of up to 1,600 pixels, so
+that cameras, and with them the figures, differ a little. The photographs of lund and buddha were compressed once more
+before they were measured.
 """
 
 from importlib.resources import files
