@@ -1,9 +1,10 @@
-"""``python -m data_tools.machine large|memory|slopes|start|roofline``: measure, print a table, write files."""
+"""``python -m data_tools.machine large|memory|conversions|slopes|start|roofline``: measure and report."""
 
 import argparse
 import sys
 from pathlib import Path
 
+from data_tools.machine.conversions import SUFFIXES, N
 from minisplat_ref.app.cli.bench import add_output_arguments, progress, publish
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import HelpFormatter, Parser, integer, list_of, name
@@ -25,6 +26,18 @@ def measure_memory(args: argparse.Namespace) -> Report:
 
     progress("memory: a few iterations in separate processes")
     return Report("Peak memory of training", (memory_case(), large_case(MODERATE)), {})
+
+
+def measure_conversions(args: argparse.Namespace) -> Report:
+    """Measure the peak memory and the time of ``convert``, format by format."""
+    from data_tools.machine.conversions import conversion_cases
+
+    progress(f"conversions: {args.gaussians:,} Gaussians to {', '.join(args.formats)}")
+    cases = []
+    for case in conversion_cases(args.gaussians, args.formats):
+        cases.append(case)
+        progress(f"conversions: {case.name} {case.figures} {case.note}")
+    return Report(f"Conversion of {args.gaussians:,} Gaussians of degree 3", tuple(cases), {})
 
 
 def measure_slopes(args: argparse.Namespace) -> Report:
@@ -63,6 +76,7 @@ def measure_roofline(args: argparse.Namespace) -> Report:
 MEASUREMENTS = {
     "large": (measure_large, "2,000 photographs of 12 megapixels within 8 GB"),
     "memory": (measure_memory, "peak of training in 1920 x 1080 and 12 megapixels"),
+    "conversions": (measure_conversions, "memory and time of convert, 5 million Gaussians"),
     "slopes": (measure_slopes, "time against hits, 12,500 to 200,000 Gaussians"),
     "start": (measure_start, "seconds to the first iteration, cold and warm"),
     "roofline": (measure_roofline, "kernels and threads against what the processor can give"),
@@ -87,6 +101,9 @@ def build_parser() -> argparse.ArgumentParser:
         own[title].add_argument(
             "--repeats", type=integer(1), default=10, metavar="N", help="timings of each, in each round (default 10)"
         )
+    add = own["conversions"].add_argument
+    add("--gaussians", type=integer(1), default=N, metavar="N", help=f"how many (default {N:,})")
+    add("--formats", type=list_of(name), default=SUFFIXES, metavar="A,B", help="suffixes (default all)")
     add = own["roofline"].add_argument
     add("--scene", type=Path, metavar="SCENE", help="photographs to train on (default a made room)")
     add("--downscale", type=integer(1), default=1, metavar="D", help="make them D times smaller (default 1)")

@@ -137,15 +137,23 @@ def read_sidecar(path: Path, content: bytes) -> Label:
     if ours is None:
         return NO_LABEL
     label = from_json(ours, sidecar)
-    if not isinstance(ours, Mapping) or ours.get("sha256") != _digest(content):
+    if not isinstance(ours, Mapping) or ours.get("sha256") != hashlib.sha256(content).hexdigest():
         message = f"{sidecar} is of another {path.name}, and is left out: remove it"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
         return NO_LABEL
     return label
 
 
-def write_sidecar(path: Path, content: bytes, label: Label) -> None:
-    """Write the label beside a file that will have this content, or remove that of an earlier file.
+def write_sidecar(path: Path, written: Path, label: Label) -> None:
+    """Write the label beside a file, or remove that of an earlier file.
+
+    Parameters
+    ----------
+    path : Path
+        Where the file will be.
+    written : Path
+        Where its content is now.
+    label : Label
 
     Raises
     ------
@@ -162,13 +170,11 @@ def write_sidecar(path: Path, content: bytes, label: Label) -> None:
         raise InputError(
             f"{sidecar} is not of this program, and is where it says how {path.name} is drawn: rename one of them"
         )
+    with written.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
     with replacing(sidecar) as temporary:
-        text = json.dumps({MARK: {**to_json(label), "sha256": _digest(content)}}, indent=2)
+        text = json.dumps({MARK: {**to_json(label), "sha256": digest}}, indent=2)
         temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _ours(value: Any) -> Any:

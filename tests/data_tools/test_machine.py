@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from data_tools.machine import (
+    conversions,
     large_scene,
     limits,
     peak_memory,
@@ -51,6 +53,28 @@ def test_bad_input_is_one_line(capsys):
     assert main(["roofline", "--iterations", "1", "--workloads", "garden"]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "minisplat-ref: " not in line]
     assert len(lines) == 1 and "--data" in lines[0]
+
+
+def test_conversions_are_measured_format_by_format(tmp_path):
+    file = tmp_path / "conversions.json"
+    assert main(["conversions", "--gaussians", "300", "--formats", ".splat,.glb", "--json", str(file)]) == 0
+    first, second = json.loads(file.read_text())["cases"]
+    assert first["name"] == ".splat" and first["file MB"] == 0 and second["name"] == ".glb"
+    assert 0 < first["CPU seconds"] and 30 < first["peak MB"] < 1000
+
+
+def test_conversions_that_take_too_much_fail(monkeypatch, capsys):
+    monkeypatch.setattr(conversions, "WITHIN", 1e6)
+    monkeypatch.setattr(conversions, "SECONDS", 0.01)
+    assert main(["conversions", "--gaussians", "10", "--formats", ".splat,.ksplat"]) == 1
+    printed = capsys.readouterr().out
+    assert "more than 1 MB; more than 0 s" in printed and "exit code 2" in printed and "not written" in printed
+
+
+def test_a_conversion_that_does_not_end_is_ended(monkeypatch):
+    monkeypatch.setattr(conversions, "GIVE_UP", 0.2)
+    spent = conversions.run([sys.executable, "-c", "import time; time.sleep(60)"])
+    assert spent.code == 124 and spent.seconds < 10
 
 
 def test_kernels_are_kept_apart_from_those_of_the_package():

@@ -309,7 +309,7 @@ def repacked(content, change):
     header = {name: value for name, value in packed.header.items() if name != "streams"}
     streams = {name: zstandard.ZstdDecompressor().decompress(frame) for name, frame in packed.frames.items()}
     change(header, streams)
-    return omg.pack(omg.CONTAINER, header, streams)
+    return omg.pack(omg.CONTAINER, header, streams.items())
 
 
 def lose_code(header, streams):

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         encode_as,
         open_source,
     )
-    from minisplat_ref.io.formats import write_file
+    from minisplat_ref.io.formats import mapped, write_file
 
     out: Path = args.output
     if out.suffix.lower() == ".html":
@@ -109,7 +109,8 @@ def run(args: argparse.Namespace) -> int:
         format_ = format_._replace(encode=partial(encode_as, format_, out, source.label))
         choice, measured = _choose(args, source, format_)
         write_file(out, format_, choice.content, source.label)
-        rows = [*format_.describe(choice.content, out), *measured]
+        content = choice.content if isinstance(choice.content, bytes) else mapped(out)
+        rows = [*format_.describe(content, out), *measured]
         lines = [f"  {name}: {value}" for name, value in rows]
     size = f"{out.stat().st_size:,} bytes"
     print(f"{len(source.model.gaussians.means):,} Gaussians of {source.what} in {out}, {size}", *lines, sep="\n")
@@ -158,7 +159,7 @@ def _write_page(args: argparse.Namespace) -> int:
         )
     name = path.resolve().name
     cameras = [view for view in source.cameras if view.split != "test"] or source.cameras
-    write_content(out, write_page(name, population, cameras, trained.background).encode())
+    write_content(out, write_page(name, population, cameras, trained.background))
     print(
         f"{len(population.means):,} Gaussians of {name} in {out}, {out.stat().st_size:,} bytes: open it in any browser"
     )
@@ -182,4 +183,6 @@ def _choose(args: argparse.Namespace, source: "Source", format_: "Format") -> "t
     level = format_.default_level if args.level is None else args.level
     if level >= len(format_.levels):
         raise InputError(f"--level {level} is too high: {format_.suffix} has levels 0 to {len(format_.levels) - 1}")
-    return conversion.Choice(level, format_.encode(gaussians, level)), []
+    if format_.write is None:
+        return conversion.Choice(level, format_.encode(gaussians, level)), []
+    return conversion.Choice(level, partial(conversion.write_as, format_, args.output, gaussians, level)), []

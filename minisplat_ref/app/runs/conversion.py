@@ -4,10 +4,11 @@ The loss by a compact file is measured on photographs that were *trained* on, at
 is a decision like others, and the test views must not influence it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -48,7 +49,8 @@ class Choice(NamedTuple):
     """A file at one level, ready to be written."""
 
     level: int
-    content: bytes
+    content: bytes | Callable[[BinaryIO], None]
+    """Of the file, or what writes it into an open file."""
     drop: float | None = None
     """dB of PSNR that are lost; None where it was not measured."""
 
@@ -163,8 +165,10 @@ def drop_outliers(population: Any) -> Dropped:
     is_far = np.linalg.norm(means - middle, axis=1) > reach
     is_large = population.log_scales.max(axis=1) > np.log(reach)
     is_outlier = is_far | is_large
-    kept = type(population)(*(field[~is_outlier] for field in population))
-    return Dropped(kept, np.flatnonzero(is_outlier))
+    rows = np.flatnonzero(is_outlier)
+    if not len(rows):
+        return Dropped(population, rows)  # itself, not a copy
+    return Dropped(type(population)(*(field[~is_outlier] for field in population)), rows)
 
 
 def describe_dropped(rows: Ints) -> str:
@@ -181,6 +185,26 @@ def encode_as(format_: Format, path: Path, label: Label, gaussians: Gaussians, l
     InputError
         A value does not fit the format.
     """
+    with _naming(path, gaussians):
+        return with_label(format_, format_.encode(gaussians, level), label)
+
+
+def write_as(format_: Format, path: Path, gaussians: Gaussians, level: int, file: BinaryIO) -> None:
+    """Write what :func:`encode_as` returns, of a format that is written a piece at a time and has no place for a label.
+
+    Raises
+    ------
+    InputError
+        A value does not fit the format.
+    """
+    assert format_.write is not None and format_.write_label is None
+    with _naming(path, gaussians):
+        format_.write(file, gaussians, level)
+
+
+@contextmanager
+def _naming(path: Path, gaussians: Gaussians) -> Iterator[None]:
+    """Refuse centres that are far from the origin, and let errors name the file and the outliers."""
     if are_far(gaussians):
         distance = float(np.abs(np.median(gaussians.means, axis=0)).max())
         raise InputError(
@@ -188,7 +212,7 @@ def encode_as(format_: Format, path: Path, label: Label, gaussians: Gaussians, l
             f" {np.spacing(np.float32(distance)):.2g}; write a PLY, which holds them in float64"
         )
     try:
-        return with_label(format_, format_.encode(gaussians, level), label)
+        yield
     except InputError as error:
         rows = drop_outliers(gaussians).rows
         way_out = f"; or leave out what is far from all others ({describe_dropped(rows)}) by --drop-outliers"

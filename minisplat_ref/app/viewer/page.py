@@ -18,30 +18,34 @@ in half floats. Left out are early termination, lenses, and whatever an extensio
 
 import base64
 import json
-import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from html import escape
 from importlib.resources import files
 from string import Template
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from minisplat_ref.app.viewer.poses import choose_start
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.orbits import orbit
+from minisplat_ref.io.packing.deflating import gzip_compressor
+from minisplat_ref.io.packing.pieces import pieces, rows_of
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_gaussians
 
 N_VIEWS_WITHOUT_CAMERAS = 8  # on a circle around a scene of which no cameras are known
 CIRCLE_SIZE = (960, 640)  # pixels of these
+ROW_BYTES = 34  # of a Gaussian without harmonics
 LEVEL_MAX = 127  # of the 8 bits of a harmonic
+BLOCK = 3 << 20  # bytes that become text at once; multiples of three have no padding
 FLOAT16_MAX = 65504.0
 
 
-def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], background: Floats) -> str:
-    """Return a self-contained page that shows Gaussians.
+def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], background: Floats) -> Iterator[bytes]:
+    """Return the parts of a self-contained page that shows Gaussians, in UTF-8.
 
     Parameters
     ----------
@@ -73,12 +77,20 @@ def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], b
         "views": [_view(view) for view in views],
     }
     folder = files("minisplat_ref.app.viewer")
-    return Template((folder / "page.html").read_text("utf-8")).substitute(
-        title=escape(title.encode("utf-8", "backslashreplace").decode()),
-        scene=json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
-        gaussians=base64.b64encode(content).decode(),
-        script=(folder / "page.js").read_text("utf-8"),
-    )
+    values = {
+        "title": escape(title.encode("utf-8", "backslashreplace").decode()),
+        "scene": json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
+        "script": (folder / "page.js").read_text("utf-8"),
+    }
+    ends = (Template(text).substitute(values) for text in (folder / "page.html").read_text("utf-8").split("$gaussians"))
+    return _parts(next(ends).encode(), content, next(ends).encode())
+
+
+def _parts(head: bytes, content: bytes, tail: bytes) -> Iterator[bytes]:
+    yield head
+    for start in range(0, len(content), BLOCK):
+        yield base64.b64encode(content[start : start + BLOCK])
+    yield tail
 
 
 def _view(view: Viewpoint) -> dict[str, Any]:
@@ -99,21 +111,31 @@ def pack(gaussians: Gaussians) -> tuple[dict[str, Any], bytes]:
     gaussians : Gaussians
         Finite.
     """
-    log_scales = gaussians.log_scales.astype(np.float64)
+    log_scales, sh_rest = gaussians.log_scales, gaussians.sh_rest
     low, high = (float(log_scales.min()), float(log_scales.max())) if log_scales.size else (0.0, 0.0)
     scale_step = max(high - low, 1e-6) / 65535
-    sh_step = max(float(np.abs(gaussians.sh_rest).max(initial=0.0)), 1e-6) / LEVEL_MAX
-    quats = gaussians.quats.astype(np.float64)
-    opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
-    parts = (
-        gaussians.means.astype("<f4"),
-        np.rint((log_scales - low) / scale_step).astype("<u2"),
-        np.rint(32767 * quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype("<i2"),
-        np.rint(65535 * opacities).astype("<u2"),
-        gaussians.sh_dc.astype("<f2"),
-        np.rint(gaussians.sh_rest.astype(np.float64) / sh_step).astype("i1"),
+    sh_step = max(float(sh_rest.max(initial=0.0)), -float(sh_rest.min(initial=0.0)), 1e-6) / LEVEL_MAX
+    fields: tuple[tuple[str, Callable[[Gaussians], NDArray]], ...] = (
+        ("centres", lambda rows: rows.means.astype("<f4")),
+        ("scales", lambda rows: np.rint((rows.log_scales - low) / scale_step).astype("<u2")),
+        ("rotations", _rotations),
+        ("opacities", _opacities),
+        ("colours", lambda rows: rows.sh_dc.astype("<f2")),
+        ("harmonics", lambda rows: np.rint(rows.sh_rest / sh_step).astype("i1")),
     )
-    n, n_rest = gaussians.sh_rest.shape[:2]
+    n, n_rest = sh_rest.shape[:2]
     header = {"n": n, "n_rest": n_rest, "scale_low": low, "scale_step": scale_step, "sh_step": sh_step}
-    compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
-    return header, compressor.compress(b"".join(part.tobytes() for part in parts)) + compressor.flush()
+    compressor = gzip_compressor(n * (ROW_BYTES + 3 * n_rest))
+    packed = []
+    for name, encode in fields:
+        for part in pieces(n, f"packing {name}"):
+            packed.append(compressor.compress(encode(rows_of(gaussians, part)).tobytes()))
+    return header, b"".join([*packed, compressor.flush()])
+
+
+def _rotations(rows: Gaussians) -> NDArray:
+    return np.rint(32767 * rows.quats / np.linalg.norm(rows.quats, axis=1, keepdims=True)).astype("<i2")
+
+
+def _opacities(rows: Gaussians) -> NDArray:
+    return np.rint(65535 * 0.5 * (1.0 + np.tanh(0.5 * rows.opacity_logits))).astype("<u2")  # of the sigmoid

@@ -12,12 +12,13 @@ byte for byte: the order, too, depends on lattice points alone, and Gaussians of
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
@@ -36,7 +37,8 @@ from minisplat_ref.io.packing.container import (
     write_label,
 )
 from minisplat_ref.io.packing.morton import morton_order
-from minisplat_ref.io.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.io.packing.pieces import pieces
+from minisplat_ref.io.packing.planes import PLANES_MAX, count_planes, from_planes, put_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
@@ -90,40 +92,63 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         opacity_logits=gaussians.opacity_logits[:, None], sh_rest=gaussians.sh_rest.reshape(n, 3 * n_rest)
     )
     steps, streams = (None, _exact_streams(rows)) if level == 0 else _lattice_streams(rows, level)
-    packed = {name: to_planes(stream) for name, stream in streams.items()}
+    planes = {name: count_planes(_largest(stream, n)) for name, stream in streams.items()}
     header = {
         "n": n,
         "sh_degree": math.isqrt(n_rest + 1) - 1,
         "level": level,
         "steps": steps and steps._asdict(),
-        "planes": {name: n_planes for name, (_, n_planes) in packed.items()},
+        "planes": planes,
     }
-    return pack(CONTAINER, header, {name: raw for name, (raw, _) in packed.items()})
+    packed = ((name, _planes(stream, n, planes[name], f"encoding {name}")) for name, stream in streams.items())
+    return pack(CONTAINER, header, packed)
 
 
-def _exact_streams(rows: Gaussians) -> dict[str, Any]:
+Stream = Callable[[slice], NDArray[np.uint64]]
+"""The integers [n, C] of some rows of a file; they are computed twice, as those of all rows do not fit into memory."""
+
+
+def _largest(stream: Stream, n: int) -> int:
+    return max((int(stream(part).max(initial=0)) for part in pieces(n, "measuring")), default=0)
+
+
+def _planes(stream: Stream, n: int, n_planes: int, description: str) -> memoryview:
+    """Return the integers of all rows as planes of bytes."""
+    planes = np.empty((n_planes, stream(slice(0, 0)).shape[1], n), np.uint8)
+    for part in pieces(n, description):
+        put_planes(planes, part, stream(part))
+    return planes.reshape(-1).data
+
+
+def _exact_streams(rows: Gaussians) -> dict[str, Stream]:
     order = morton_order(rows.means)
-    return {name: field[order].view(np.uint32).astype(np.uint64) for name, field in rows._asdict().items()}
+
+    def bits(part: slice, field: Floats) -> NDArray[np.uint64]:
+        return field[order[part]].view(np.uint32).astype(np.uint64)
+
+    return {name: partial(bits, field=field) for name, field in rows._asdict().items()}
 
 
-def _lattice_streams(rows: Gaussians, level: int) -> tuple[Exponents, dict[str, Any]]:
+def _lattice_streams(rows: Gaussians, level: int) -> tuple[Exponents, dict[str, Stream]]:
     steps = levels.exponents(level)
     log_scales = lattice.to_lattice(rows.log_scales, steps.log_scales, "log_scales")
     steps = steps._replace(means=steps.means + levels.size_exponent(log_scales, steps.log_scales))
     means = lattice.to_lattice(rows.means, steps.means, "means")
     order = morton_order(means)
-    rotations = lattice.to_rotations(rows.quats[order], steps.quats)
-    integers = {
-        "means": np.diff(means[order], axis=0, prepend=0),
-        "largest": rotations.largest[:, None],
-        "quats": rotations.others,
-        "log_scales": log_scales[order],
-        **{
-            name: lattice.to_lattice(getattr(rows, name)[order], getattr(steps, name), name)
-            for name in ("opacity_logits", "sh_dc", "sh_rest")
-        },
-    }
-    return steps, {name: zigzag(stream) for name, stream in integers.items()}
+    means = np.diff(means[order], axis=0, prepend=0)
+
+    def largest(part: slice) -> NDArray[np.uint64]:
+        return zigzag(lattice.to_rotations(rows.quats[order[part]], steps.quats).largest[:, None])
+
+    def quats(part: slice) -> NDArray[np.uint64]:
+        return zigzag(lattice.to_rotations(rows.quats[order[part]], steps.quats).others)
+
+    def field(part: slice, name: str) -> NDArray[np.uint64]:
+        return zigzag(lattice.to_lattice(getattr(rows, name)[order[part]], getattr(steps, name), name))
+
+    names = ("log_scales", "opacity_logits", "sh_dc", "sh_rest")
+    fields = {name: partial(field, name=name) for name in names}
+    return steps, {"means": lambda part: zigzag(means[part]), "largest": largest, "quats": quats, **fields}
 
 
 def decode(content: bytes, source: str | Path) -> Gaussians:

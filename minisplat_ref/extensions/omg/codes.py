@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.packing.container import WAY_OUT, Packed, is_count, unpack
+from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.io.packing.planes import PLANES_MAX, from_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Ints
 
@@ -42,7 +43,7 @@ class Quantised(NamedTuple):
     codes: tuple[Floats, ...]
     """A codebook [K, w] of float16 for each part; K may be less than was allowed."""
     indices: Ints
-    """[N, P] rows of the codebooks."""
+    """[N, P] rows of the codebooks, which have at most 2^16."""
 
     def vectors(self) -> Floats:
         """Return the vectors [N, P w] that the codes represent, float32."""
@@ -67,7 +68,7 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
         part = vectors[:, begin : begin + width].astype(np.float64)
         book = np.unique(fit_codes(part, n_codes).astype(np.float16), axis=0)
         codes.append(book)
-        indices.append(nearest(book.astype(np.float64), part))
+        indices.append(nearest(book.astype(np.float64), part, "finding codes").astype(np.uint16))
     return Quantised(tuple(codes), np.stack(indices, axis=1))
 
 
@@ -103,11 +104,14 @@ def _initial_codes(vectors: Floats, n_codes: int) -> Floats:
     return vectors[rows[np.linspace(0, len(rows) - 1, n_codes).round().astype(int)]]
 
 
-def nearest(codes: Floats, vectors: Floats) -> Ints:
-    """Return the row [N] of the code [K, w] nearest to each vector [N, w]."""
-    if len(vectors) == 0:
-        return np.zeros(0, np.int64)
-    return cKDTree(codes).query(vectors)[1].astype(np.int64)
+def nearest(codes: Floats, vectors: Floats, description: str = "fitting codes") -> Ints:
+    """Return the row [N] of the code [K, w] nearest to each vector [N, w]; the description is for the progress bar."""
+    rows = np.empty(len(vectors), np.int64)
+    tree = cKDTree(codes) if len(vectors) else None
+    for part in pieces(len(vectors), description):
+        assert tree is not None
+        rows[part] = tree.query(vectors[part])[1]
+    return rows
 
 
 def round_to_halves(values: Floats, name: str) -> Floats:
@@ -118,11 +122,15 @@ def round_to_halves(values: Floats, name: str) -> Floats:
     InputError
         They are too large; ``name`` is their name.
     """
-    if not np.abs(values).max(initial=0.0) <= LARGEST_HALF:
-        raise InputError(
-            f"{name} reach {np.abs(values).max():.3g}, but half floats {LARGEST_HALF:g}: choose another format"
-        )
+    check_halves(values, name)
     return values.astype(np.float16)
+
+
+def check_halves(values: Floats, name: str) -> None:
+    """Refuse values beyond half floats; arguments and errors as for :func:`round_to_halves`."""
+    largest = max(values.max(initial=0.0), -values.min(initial=0.0))
+    if not largest <= LARGEST_HALF:
+        raise InputError(f"{name} reach {largest:.3g}, but half floats {LARGEST_HALF:g}: choose another format")
 
 
 def encode_differences(halves: Floats) -> Any:

@@ -23,7 +23,7 @@ which are a matrix product.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from minisplat_ref.extensions.omg.codes import (
     Quantised,
     are_codes,
     are_planes,
+    check_halves,
     decode_differences,
     encode_differences,
     is_center,
@@ -53,7 +54,8 @@ from minisplat_ref.io.formats import Format
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.packing.container import Container, Packed, is_count, pack, parse, read_label, unpack, write_label
 from minisplat_ref.io.packing.morton import morton_order
-from minisplat_ref.io.packing.planes import to_planes
+from minisplat_ref.io.packing.pieces import pieces
+from minisplat_ref.io.packing.planes import count_planes, to_planes
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
@@ -88,8 +90,23 @@ def fit_decoder(harmonics: Floats, n_features: int) -> Decoder:
     n, d = harmonics.shape
     rows = harmonics.astype(np.float64)
     mean = rows.mean(axis=0) if n else np.zeros(d)
-    values, vectors = np.linalg.eigh((rows - mean).T @ (rows - mean))  # ascending
-    strongest = np.argsort(-values, kind="stable")[: min(n_features, d)]
+    return principal_decoder(mean, (rows - mean).T @ (rows - mean), n_features)
+
+
+def principal_decoder(mean: Floats, squares: Floats, n_features: int) -> Decoder:
+    """Return the decoder of the principal directions.
+
+    Parameters
+    ----------
+    mean : ndarray of shape (D,)
+        m.
+    squares : ndarray of shape (D, D)
+        ``sum_i (h_i - m) (h_i - m)^T``.
+    n_features : int
+        F; it is reduced to D if that is smaller.
+    """
+    values, vectors = np.linalg.eigh(squares)  # ascending
+    strongest = np.argsort(-values, kind="stable")[: min(n_features, len(mean))]
     return Decoder(mean.astype(np.float16), vectors[:, strongest].T.astype(np.float16))
 
 
@@ -146,39 +163,70 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         )
     offsets = round_to_halves(gaussians.means - center, "means")
     order = morton_order(offsets)
-    rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
-    harmonics = rows.sh_rest.reshape(n, 3 * n_rest)
-    round_to_halves(harmonics, "sh_rest")
-    decoder = fit_decoder(harmonics, sizes.n_features)
-    features = compute_features(harmonics, decoder)
-    vectors = {
-        "scales": rows.log_scales,
-        "rotations": unit_quats(rows.quats),
-        "opacities": rows.opacity_logits[:, None],
-        "appearance": np.concatenate([rows.sh_dc, features, np.zeros((n, (3 + features.shape[1]) % 2))], axis=1),
-    }
-    quantised = {
-        name: quantise(round_to_halves(values, name).astype(np.float64), WIDTHS[name], getattr(sizes, name))
-        for name, values in vectors.items()
-    }
+    check_halves(gaussians.sh_rest, "sh_rest")
+    decoder = _fit_decoder(gaussians, order, sizes.n_features)
+    vectors = _vectors(gaussians, order, decoder)
+    quantised = {name: quantise(values, WIDTHS[name], getattr(sizes, name)) for name, values in vectors.items()}
     is_zero = (quantised["rotations"].codes[0] == 0).all(axis=1)
     quantised["rotations"].codes[0][is_zero] = [QUAT_MIN, 0.0]
-    streams, planes = {}, {}
-    for name, integers in _integers(offsets[order], quantised).items():
-        streams[name], planes[name] = to_planes(integers)
-    for name, of_parts in quantised.items():
-        streams[f"{name} codes"] = b"".join(codes.tobytes() for codes in of_parts.codes)
-    streams["decoder"] = decoder.mean.tobytes() + decoder.directions.tobytes()
+    integers = _integers(offsets[order], quantised)
+    n_features = len(decoder.directions)
     header = {
         "n": n,
         "sh_degree": math.isqrt(n_rest + 1) - 1,
         "level": level,
         "center": [float(x) for x in center],
-        "n_features": features.shape[1],
+        "n_features": n_features,
         "codes": {name: [len(codes) for codes in of_parts.codes] for name, of_parts in quantised.items()},
-        "planes": planes,
+        "planes": {name: count_planes(int(values.max(initial=0))) for name, values in integers.items()},
     }
-    return pack(CONTAINER, header, streams)
+    return pack(CONTAINER, header, _streams(integers, quantised, decoder))
+
+
+def _streams(
+    integers: Mapping[str, Any], quantised: Mapping[str, Quantised], decoder: Decoder
+) -> Iterator[tuple[str, bytes]]:
+    for name, values in integers.items():
+        yield name, to_planes(values.astype(np.uint64, copy=False))[0]
+    for name, of_parts in quantised.items():
+        yield f"{name} codes", b"".join(codes.tobytes() for codes in of_parts.codes)
+    yield "decoder", decoder.mean.tobytes() + decoder.directions.tobytes()
+
+
+def _harmonics(gaussians: Gaussians, order: Ints, description: str) -> Iterator[tuple[slice, Floats]]:
+    """Yield rows of a file with their harmonics [n, 3 (K-1)], a piece at a time."""
+    for part in pieces(len(order), description):
+        rows = gaussians.sh_rest[order[part]].astype(np.float64)
+        yield part, rows.reshape(len(rows), rows.shape[1] * 3)
+
+
+def _fit_decoder(gaussians: Gaussians, order: Ints, n_features: int) -> Decoder:
+    """Return :func:`fit_decoder` of all rows in the order of the file, summed a piece at a time."""
+    n, d = len(order), 3 * gaussians.sh_rest.shape[1]
+    mean, squares = np.zeros(d), np.zeros((d, d))
+    for _, rows in _harmonics(gaussians, order, "averaging"):
+        mean += rows.sum(axis=0)
+    mean /= max(n, 1)
+    for _, rows in _harmonics(gaussians, order, "fitting"):
+        squares += (rows - mean).T @ (rows - mean)
+    return principal_decoder(mean, squares, n_features)
+
+
+def _vectors(gaussians: Gaussians, order: Ints, decoder: Decoder) -> dict[str, Floats]:
+    """Return the vectors [N, D] that are quantised, in half floats, by the names of their codebooks."""
+    n, n_appearance = len(order), 3 + len(decoder.directions)
+    vectors = {
+        "scales": round_to_halves(gaussians.log_scales[order], "scales"),
+        "rotations": np.empty((n, 4), np.float16),
+        "opacities": round_to_halves(gaussians.opacity_logits[order, None], "opacities"),
+        "appearance": np.zeros((n, n_appearance + n_appearance % 2), np.float16),
+    }
+    for part, harmonics in _harmonics(gaussians, order, "encoding"):
+        colors = gaussians.sh_dc[order[part]].astype(np.float64)
+        appearance = np.concatenate([colors, compute_features(harmonics, decoder)], axis=1)
+        vectors["appearance"][part, :n_appearance] = round_to_halves(appearance, "appearance")
+        vectors["rotations"][part] = unit_quats(gaussians.quats[order[part]].astype(np.float64))
+    return vectors
 
 
 def _center(gaussians: Gaussians) -> Floats:
@@ -194,8 +242,7 @@ def find_order(gaussians: Gaussians) -> Ints:
 
 def _integers(offsets: Floats, quantised: Mapping[str, Quantised]) -> dict[str, Any]:
     """Return the integers that are packed as planes of bytes: differences of the centres, and indices."""
-    indices = {name: of_parts.indices.astype(np.uint64) for name, of_parts in quantised.items()}
-    return {"means": encode_differences(offsets), **indices}
+    return {"means": encode_differences(offsets), **{name: of_parts.indices for name, of_parts in quantised.items()}}
 
 
 def decode(content: bytes, source: str | Path) -> Gaussians:

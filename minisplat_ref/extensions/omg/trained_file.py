@@ -92,7 +92,7 @@ def encode(model: Model, frame: Frame) -> bytes:
         "codes": codes,
         "planes": planes,
     }
-    return pack(CONTAINER, header, streams)
+    return pack(CONTAINER, header, streams.items())
 
 
 def _find_used(rows: Ints) -> tuple[Any, list[Ints]]:

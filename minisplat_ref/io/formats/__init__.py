@@ -11,10 +11,11 @@ They hold the six fields of 3DGS; the fields of an extension need a PLY. An exte
 way is recorded in a file beside theirs (:mod:`minisplat_ref.io.label`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from io import BytesIO
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 from zipfile import ZipFile
 
 import numpy as np
@@ -46,8 +47,12 @@ class Format(NamedTuple):
     """``encode(gaussians, level)``: a whole file. Raises InputError where a value does not fit the format."""
     decode: Callable[[bytes, str | Path], Gaussians]
     """``decode(content, source)`` of a whole file; float32, finite. Raises InputError, which names ``source``."""
-    describe: Callable[[bytes, str | Path], list[tuple[str, str]]]
-    """``describe(content, source)``: the content of the file and its precision, as names and values."""
+    describe: Callable[[Any, str | Path], list[tuple[str, str]]]
+    """``describe(content, source)``: the content of the file and its precision, as names and values. Of a format with
+    ``write``, the content may be a :func:`mapped` file."""
+    write: Callable[[BinaryIO, Gaussians, int], None] | None = None
+    """``write(file, gaussians, level)``: what ``encode`` returns, a piece at a time; None where that is much smaller
+    than the Gaussians. Raises InputError, before anything is written."""
     write_label: Callable[[bytes, Label], bytes] | None = None
     """``write_label(content, label)``: the content with a label in it; None where there is no place for one, so that it
     goes into a sidecar."""
@@ -74,6 +79,12 @@ def read_content(path: str | Path) -> bytes:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
 
 
+def mapped(path: Path) -> memoryview:
+    """Return the content of a file that is not empty, without a copy in memory."""
+    with path.open("rb") as file:
+        return memoryview(mmap(file.fileno(), 0, access=ACCESS_READ))
+
+
 def bundle(meta: Path) -> bytes:
     """Return a SOG that is not packed, the folder of its ``meta.json``, as the one file that it would be.
 
@@ -96,8 +107,8 @@ def bundle(meta: Path) -> bytes:
     return packed.getvalue()
 
 
-def write_content(path: str | Path, content: bytes) -> None:
-    """Write a file, complete or not at all.
+def write_content(path: str | Path, content: bytes | Iterable[bytes]) -> None:
+    """Write a file, or the parts of one, complete or not at all.
 
     Raises
     ------
@@ -105,7 +116,11 @@ def write_content(path: str | Path, content: bytes) -> None:
         As for :func:`minisplat_ref.io.atomic.replacing`.
     """
     with replacing(path) as temporary:
-        temporary.write_bytes(content)
+        if isinstance(content, bytes):
+            temporary.write_bytes(content)
+        else:
+            with temporary.open("wb") as file:
+                file.writelines(content)
 
 
 def with_label(format_: Format, content: bytes, label: Label) -> bytes:
@@ -113,8 +128,16 @@ def with_label(format_: Format, content: bytes, label: Label) -> bytes:
     return content if label == NO_LABEL or format_.write_label is None else format_.write_label(content, label)
 
 
-def write_file(path: Path, format_: Format, content: bytes, label: Label) -> None:
+def write_file(path: Path, format_: Format, content: bytes | Callable[[BinaryIO], None], label: Label) -> None:
     """Write a compact file with its label in the content if the format has a place for it, and else beside it.
+
+    Parameters
+    ----------
+    path : Path
+    format_ : Format
+    content : bytes or callable
+        Of the file, or what writes it into an open file.
+    label : Label
 
     Raises
     ------
@@ -122,9 +145,13 @@ def write_file(path: Path, format_: Format, content: bytes, label: Label) -> Non
         As for :func:`write_content`, or another program's file is where the label should be; nothing is written then.
     """
     with replacing(path) as temporary:
-        temporary.write_bytes(content)
+        if isinstance(content, bytes):
+            temporary.write_bytes(content)
+        else:
+            with temporary.open("wb") as file:
+                content(file)
         if format_.write_label is None:  # first, so that the file is never there without it
-            write_sidecar(path, content, label)
+            write_sidecar(path, temporary, label)
 
 
 def label_of(path: Path, format_: Format, content: bytes) -> Label:

@@ -36,6 +36,7 @@ from minisplat_ref.io.formats.levels8 import (
     restore_largest,
 )
 from minisplat_ref.io.packing.morton import morton_order
+from minisplat_ref.io.packing.pieces import pieces, rows_of
 from minisplat_ref.io.ply_file import read_header
 from minisplat_ref.types import Floats, Gaussians
 
@@ -68,26 +69,16 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         A value is not finite, or beyond float32.
     """
     check_float32(gaussians)
-    order = morton_order(gaussians.means.astype(np.float64))
-    sorted_ = Gaussians(*(field[order].astype(np.float64) for field in gaussians))
-    n, n_rest = sorted_.sh_rest.shape[:2]
+    order = morton_order(gaussians.means)
+    n, n_rest = gaussians.sh_rest.shape[:2]
     n_chunks = -(-n // CHUNK)
-    begins = np.arange(n_chunks) * CHUNK
-    values = np.stack(
-        [sorted_.means, np.clip(sorted_.log_scales, -LOG_SCALE_MAX, LOG_SCALE_MAX), 0.5 + SH_C0 * sorted_.sh_dc], axis=1
-    )  # [N, 3, 3]
-    bounds = np.zeros((n_chunks, 3, 2, 3), "<f4")
-    if n:
-        bounds[:, :, 0], bounds[:, :, 1] = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
-    low, high = np.moveaxis(bounds.astype(np.float64)[np.arange(n) // CHUNK], 2, 0)  # [N, 3, 3] each
-    shares = np.clip((values - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
-    largest, others = drop_largest(sorted_.quats)
-    words = np.empty((n, 4), "<u4")
-    words[:, 0] = _pack(shares[:, 0], BITS)
-    words[:, 1] = largest.astype(np.uint32) << 30 | _pack(others, np.array([10, 10, 10]))
-    words[:, 2] = _pack(shares[:, 1], BITS)
-    words[:, 3] = _pack(shares[:, 2], np.array([8, 8, 8])) << 8 | opacity_bytes(sorted_.opacity_logits)
-    rest = np.clip(np.floor(256.0 * (sorted_.sh_rest / SH_RANGE + 0.5)), 0, 255).astype(np.uint8)  # [N, K-1, 3]
+    bounds, words = np.zeros((n_chunks, 3, 2, 3), "<f4"), np.empty((n, 4), "<u4")
+    rest = np.empty((n, 3, n_rest), np.uint8)
+    for part in pieces(n):  # of whole chunks
+        rows = rows_of(gaussians, order[part])
+        chunks = slice(part.start // CHUNK, -(-part.stop // CHUNK))
+        bounds[chunks], words[part] = _encode_words(rows)
+        rest[part] = np.clip(np.floor(256.0 * (rows.sh_rest / SH_RANGE + 0.5)), 0, 255).transpose(0, 2, 1)
     lines = [
         *("ply", "format binary_little_endian 1.0", f"element chunk {n_chunks}"),
         *(f"property float {name}" for name in BOUNDS),
@@ -97,7 +88,26 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         *(f"property uchar f_rest_{i}" for i in range(3 * n_rest)),
         "end_header\n",
     ]
-    return b"".join(["\n".join(lines).encode(), bounds.tobytes(), words.tobytes(), rest.transpose(0, 2, 1).tobytes()])
+    return b"".join(["\n".join(lines).encode(), bounds.data, words.data, rest.data])
+
+
+def _encode_words(rows: Gaussians) -> tuple[Floats, NDArray[np.uint32]]:
+    """Return the bounds [C, 3, 2, 3] of chunks, float32, and the words [n, 4] of their Gaussians."""
+    n = len(rows.means)
+    values = np.stack(
+        [rows.means, np.clip(rows.log_scales, -LOG_SCALE_MAX, LOG_SCALE_MAX), 0.5 + SH_C0 * rows.sh_dc], axis=1
+    )  # [n, 3, 3]
+    begins = np.arange(0, n, CHUNK)
+    bounds = np.stack([np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)], axis=2, dtype="<f4")
+    low, high = np.moveaxis(bounds.astype(np.float64)[np.arange(n) // CHUNK], 2, 0)  # [n, 3, 3] each
+    shares = np.clip((values - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
+    largest, others = drop_largest(rows.quats)
+    words = np.empty((n, 4), "<u4")
+    words[:, 0] = _pack(shares[:, 0], BITS)
+    words[:, 1] = largest.astype(np.uint32) << 30 | _pack(others, np.array([10, 10, 10]))
+    words[:, 2] = _pack(shares[:, 1], BITS)
+    words[:, 3] = _pack(shares[:, 2], np.array([8, 8, 8])) << 8 | opacity_bytes(rows.opacity_logits)
+    return bounds, words
 
 
 def _pack(shares: Floats, bits: NDArray) -> NDArray[np.uint32]:

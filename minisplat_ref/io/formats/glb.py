@@ -23,11 +23,14 @@ by further extensions; they are refused.
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
@@ -35,12 +38,14 @@ from minisplat_ref.io.formats import GLTF_AXES, Format
 from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
+    check_scales,
     color_bytes,
     finish,
     finite_scales,
     opacity_bytes,
     refuse_size,
 )
+from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.types import Floats, Gaussians
 
 NAME = "KHR_gaussian_splatting"
@@ -60,59 +65,103 @@ SIGNS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float
 class _File(NamedTuple):
     attributes: Mapping[str, Any]
     document: Mapping[str, Any]
-    content: bytes
+    content: bytes | memoryview
     """The chunk of bytes."""
 
 
 def encode(gaussians: Gaussians, level: int) -> bytes:
-    """Return the content of a file; it has one level.
+    """Return the content of a file; arguments and errors as for :func:`write`."""
+    file = BytesIO()
+    write(file, gaussians, level)
+    return file.getvalue()
+
+
+def write(file: BinaryIO, gaussians: Gaussians, level: int) -> None:
+    """Write the content of a file a piece at a time, as it is as large as the Gaussians; it has one level.
 
     Raises
     ------
     InputError
-        A value is not finite, or a scale is beyond float32.
+        A value is not finite, or a scale is beyond float32; nothing has been written then.
     """
     check_float32(gaussians)
-    scales = finite_scales(gaussians)
-    quats = gaussians.quats / np.linalg.norm(gaussians.quats.astype(np.float64), axis=1, keepdims=True)
-    colors = np.concatenate([color_bytes(gaussians.sh_dc), opacity_bytes(gaussians.opacity_logits)[:, None]], axis=1)
-    n_rest = gaussians.sh_rest.shape[1]
-    rest = gaussians.sh_rest * SIGNS[:n_rest, None]
-    arrays = {
-        "POSITION": (gaussians.means * GLTF_AXES).astype("<f4"),
-        "COLOR_0": colors,
-        f"{NAME}:ROTATION": np.roll(quats, -1, axis=1).astype("<f4") * np.array([-1, -1, 1, 1], "<f4"),
-        f"{NAME}:SCALE": scales,
-        f"{NAME}:OPACITY": (0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))).astype("<f4"),
-        f"{NAME}:SH_DEGREE_0_COEF_0": gaussians.sh_dc.astype("<f4"),
-        **{name: rest[:, i].astype("<f4") for i, name in enumerate(_rest_names(n_rest))},
-    }
+    check_scales(gaussians)
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    attributes = _attributes(n_rest)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     begin = 0
-    for name, array in arrays.items():
-        views.append({"buffer": 0, "byteOffset": begin, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
-        begin += array.nbytes
-        is_color = name == "COLOR_0"
-        accessor: dict[str, Any] = {"bufferView": len(accessors), "componentType": 5121 if is_color else 5126}
-        accessor |= {"count": len(array), "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"}
-        if is_color:
+    for name, attribute in attributes.items():
+        n_bytes = n * attribute.row_bytes
+        views.append({"buffer": 0, "byteOffset": begin, "byteLength": n_bytes, "target": ARRAY_BUFFER})
+        begin += n_bytes
+        accessor: dict[str, Any] = {"bufferView": len(accessors), "componentType": attribute.component, "count": n}
+        accessor["type"] = "SCALAR" if attribute.n_columns == 1 else f"VEC{attribute.n_columns}"
+        if name == "COLOR_0":
             accessor["normalized"] = True
-        if name == "POSITION" and len(array):
-            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        if name == "POSITION" and n:
+            means = attribute.values(gaussians)
+            accessor |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
         accessors.append(accessor)
     splatting = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
-    primitive = {"attributes": {name: i for i, name in enumerate(arrays)}, "mode": POINTS}
+    primitive = {"attributes": {name: i for i, name in enumerate(attributes)}, "mode": POINTS}
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "minisplat_ref"}, "extensionsUsed": [NAME]}
-    if len(gaussians.means):  # an accessor of glTF has at least one element
+    if n:  # an accessor of glTF has at least one element
         document |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
         document |= {"meshes": [{"primitives": [primitive | {"extensions": {NAME: splatting}}]}]}
         document |= {"buffers": [{"byteLength": begin}], "bufferViews": views, "accessors": accessors}
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    body = b"".join(array.tobytes() for array in arrays.values())
-    chunks = CHUNK.pack(len(text), b"JSON") + text + (CHUNK.pack(len(body), b"BIN\0") + body if body else b"")
-    return HEADER.pack(MAGIC, VERSION, HEADER.size + len(chunks)) + chunks
+    n_chunks = CHUNK.size + len(text) + (CHUNK.size + begin if n else 0)
+    file.write(HEADER.pack(MAGIC, VERSION, HEADER.size + n_chunks))
+    file.write(CHUNK.pack(len(text), b"JSON") + text + (CHUNK.pack(begin, b"BIN\0") if n else b""))
+    for name, attribute in attributes.items():
+        for part in pieces(n, f"writing {name.removeprefix(f'{NAME}:')}"):
+            file.write(attribute.values(Gaussians(*(field[part] for field in gaussians))).data)
+
+
+class _Attribute(NamedTuple):
+    """An array of the file."""
+
+    n_columns: int
+    values: Callable[[Gaussians], NDArray]
+    """Of Gaussians, [N] or [N, n_columns], C-contiguous."""
+    component: int = 5126
+    """Of :data:`DTYPES`."""
+
+    @property
+    def row_bytes(self) -> int:
+        return self.n_columns * np.dtype(DTYPES[self.component]).itemsize
+
+
+def _attributes(n_rest: int) -> dict[str, _Attribute]:
+    """Return the arrays of a file by the names of their attributes, in its order."""
+
+    def rest(gaussians: Gaussians, i: int) -> NDArray:
+        return (gaussians.sh_rest[:, i] * SIGNS[i]).astype("<f4")
+
+    return {
+        "POSITION": _Attribute(3, lambda g: (g.means * GLTF_AXES).astype("<f4")),
+        "COLOR_0": _Attribute(4, _colors, 5121),
+        f"{NAME}:ROTATION": _Attribute(4, _rotations),
+        f"{NAME}:SCALE": _Attribute(3, finite_scales),
+        f"{NAME}:OPACITY": _Attribute(1, _opacities),
+        f"{NAME}:SH_DEGREE_0_COEF_0": _Attribute(3, lambda g: g.sh_dc.astype("<f4")),
+        **{name: _Attribute(3, partial(rest, i=i)) for i, name in enumerate(_rest_names(n_rest))},
+    }
+
+
+def _colors(gaussians: Gaussians) -> NDArray:
+    return np.concatenate([color_bytes(gaussians.sh_dc), opacity_bytes(gaussians.opacity_logits)[:, None]], axis=1)
+
+
+def _rotations(gaussians: Gaussians) -> NDArray:
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats.astype(np.float64), axis=1, keepdims=True)
+    return np.roll(quats, -1, axis=1).astype("<f4") * np.array([-1, -1, 1, 1], "<f4")
+
+
+def _opacities(gaussians: Gaussians) -> NDArray:
+    return (0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))).astype("<f4")
 
 
 def _rest_names(n_rest: int) -> list[str]:
@@ -190,7 +239,7 @@ def _read(file: _File, name: str, n_columns: int, source: str | Path) -> Floats:
     return values
 
 
-def _parse(content: bytes, source: str | Path) -> _File:
+def _parse(content: bytes | memoryview, source: str | Path) -> _File:
     refuse_size(source, HEADER.size + CHUNK.size, len(content))
     magic, version, length = HEADER.unpack_from(content)
     if magic != MAGIC or version != VERSION:
@@ -200,13 +249,13 @@ def _parse(content: bytes, source: str | Path) -> _File:
     begin = HEADER.size + CHUNK.size
     if kind != b"JSON" or n_text > min(JSON_MAX, len(content) - begin):
         raise InputError(f"{source}: damaged, its JSON has {n_text:,} bytes; {WAY_OUT}")
-    body = b""
+    body = content[:0]
     if begin + n_text + CHUNK.size <= len(content):
         n_body, _ = CHUNK.unpack_from(content, begin + n_text)
         refuse_size(source, begin + n_text + CHUNK.size + n_body, len(content))
         body = content[begin + n_text + CHUNK.size :][:n_body]
     try:
-        document = json.loads(content[begin : begin + n_text])
+        document = json.loads(bytes(content[begin : begin + n_text]))
         found = [
             p for mesh in document.get("meshes", []) for p in mesh["primitives"] if NAME in p.get("extensions", {})
         ]
@@ -227,7 +276,7 @@ def _parse(content: bytes, source: str | Path) -> _File:
     return _File(attributes, document, body)
 
 
-def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
+def describe(content: bytes | memoryview, source: str | Path) -> list[tuple[str, str]]:
     """Return a description of a file, as pairs of name and text.
 
     Raises
@@ -245,6 +294,7 @@ GLB = Format(
     levels=("float32",),
     default_level=0,
     encode=encode,
+    write=write,
     decode=decode,
     describe=describe,
 )

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
@@ -85,24 +86,31 @@ def check_float32(gaussians: Gaussians) -> None:
         A value is not finite, or beyond float32.
     """
     with np.errstate(over="ignore"):
-        check_gaussians(Gaussians(*(field.astype(np.float32) for field in gaussians)), "Gaussians")
+        check_gaussians(Gaussians(*(field.astype(np.float32, copy=False) for field in gaussians)), "Gaussians")
 
 
 def finite_scales(gaussians: Gaussians) -> NDArray[np.float32]:
-    """Return the scales [N, 3] of Gaussians, for files that do not hold their logarithms.
+    """Return the scales [N, 3] of Gaussians, for files that do not hold their logarithms; see :func:`check_scales`."""
+    return np.exp(gaussians.log_scales.astype(np.float64)).astype("<f4")
+
+
+def check_scales(gaussians: Gaussians) -> None:
+    """Refuse Gaussians whose scales a file of float32 does not hold.
 
     Raises
     ------
     InputError
         One is infinite or zero in float32.
     """
-    with np.errstate(over="ignore"):
-        scales = np.exp(gaussians.log_scales.astype(np.float64)).astype("<f4")
-    bad = np.flatnonzero(~np.isfinite(scales).all(axis=1) | (scales == 0).any(axis=1))
-    if bad.size:
-        value = gaussians.log_scales[bad[0]].tolist()
-        raise InputError(f"the scales of row {bad[0]}, e^{value}, are beyond float32: remove its Gaussian")
-    return scales
+    for part in pieces(len(gaussians.log_scales), "checking"):
+        rows = gaussians._replace(log_scales=gaussians.log_scales[part])
+        with np.errstate(over="ignore"):
+            scales = finite_scales(rows)
+        bad = np.flatnonzero(~np.isfinite(scales).all(axis=1) | (scales == 0).any(axis=1))
+        if bad.size:
+            value = rows.log_scales[bad[0]].tolist()
+            row = part.start + bad[0]
+            raise InputError(f"the scales of row {row}, e^{value}, are beyond float32: remove its Gaussian")
 
 
 def refuse_size(source: str | Path, needed: int, found: int) -> None:

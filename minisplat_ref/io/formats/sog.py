@@ -12,9 +12,10 @@ shN_labels    low and high byte of the entry that a Gaussian has
 ============= ===============================================================================================
 
 Up to 65,536 Gaussians have an entry each. Of more, the palette is the means of the leaves of a tree, whose nodes are
-halved along the coefficient of largest variance. Codebooks begin at equal shares of the cube root of the histogram,
-which is best for squared errors where levels are many, and are improved by Lloyd's steps. We write Gaussians in Morton
-order. The frame is that of the PLY. Left out are version 1, folders without a ZIP, and levels of detail.
+halved along the coefficient of largest variance; of more than a million, the tree is that of a sample from all over the
+scene. Codebooks begin at equal shares of the cube root of the histogram, which is best for squared errors where levels
+are many, and are improved by Lloyd's steps. We write Gaussians in Morton order. The frame is that of the PLY. Left out
+are version 1, folders without a ZIP, and levels of detail.
 """
 
 import json
@@ -44,11 +45,13 @@ from minisplat_ref.io.formats.levels8 import (
     restore_largest,
 )
 from minisplat_ref.io.packing.morton import morton_order
+from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 VERSION = 2
 META = "meta.json"
-PALETTE_MAX = 1 << 16  # entries
+PALETTE_MAX = 1 << 16  # entries, a power of two
+SAMPLES_MAX = 1 << 20  # Gaussians of which the tree is made
 PER_ROW = 64  # entries of the palette
 MODE = 252  # alpha of a rotation whose largest component is w
 N_LEVELS, N_BINS, N_STEPS = 256, 256, 8  # of a codebook, of the histogram that it begins with, and of Lloyd
@@ -75,23 +78,23 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         A value is not finite, or beyond float32.
     """
     check_float32(gaussians)
-    order = morton_order(gaussians.means.astype(np.float64))
-    sorted_ = Gaussians(*(field[order].astype(np.float64) for field in gaussians))
-    n, n_rest = sorted_.sh_rest.shape[:2]
-    logs = np.sign(sorted_.means) * np.log1p(np.abs(sorted_.means))  # [N, 3]
-    mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
-    steps = np.rint(65535 * (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0)).astype(np.uint16)
-    largest, others = drop_largest(sorted_.quats)
-    scale_book, scales = _codebook(sorted_.log_scales)
-    color_book, colors = _codebook(sorted_.sh_dc)
-    quats = np.concatenate([np.floor(255.0 * others + 0.5), MODE + largest[:, None]], axis=1)  # [N, 4]
+    order = morton_order(gaussians.means)
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    mins, maxs, steps = _steps(gaussians.means[order].astype(np.float64))
+    scale_book, scales = _codebook(gaussians.log_scales[order].astype(np.float64))
+    color_book, colors = _codebook(gaussians.sh_dc[order].astype(np.float64))
+    quats, opacities = np.empty((n, 4), np.uint8), np.empty((n, 1), np.uint8)
+    for part in pieces(n):
+        largest, others = drop_largest(gaussians.quats[order[part]].astype(np.float64))
+        quats[part, :3], quats[part, 3] = np.floor(255.0 * others + 0.5), MODE + largest
+        opacities[part, 0] = opacity_bytes(gaussians.opacity_logits[order[part]])
     width = max(4, 4 * math.ceil(math.sqrt(n) / 4))
     images = {
         "means_l": _image(steps & 255, width),
         "means_u": _image(steps >> 8, width),
         "quats": _image(quats, width),
         "scales": _image(scales, width),
-        "sh0": _image(np.concatenate([colors, opacity_bytes(sorted_.opacity_logits)[:, None]], axis=1), width),
+        "sh0": _image(np.concatenate([colors, opacities], axis=1), width),
     }
     meta: dict[str, Any] = {
         "version": VERSION,
@@ -102,7 +105,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         "sh0": {"codebook": color_book, "files": ["sh0.webp"]},
     }
     if n_rest and n:
-        palette, labels = _palette(sorted_.sh_rest.reshape(n, -1))
+        palette, labels = _palette(gaussians.sh_rest, order)
         book, entries = _codebook(palette)
         rows = np.zeros((math.ceil(len(palette) / PER_ROW) * PER_ROW, 3 * n_rest), np.uint8)
         rows[: len(entries)] = entries
@@ -119,6 +122,13 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
             image.save(packed, "webp", lossless=True, exact=True, quality=100)  # exact: colours under alpha 0 count
             archive.writestr(zipfile.ZipInfo(f"{name}.webp", DATE), packed.getvalue())
     return file.getvalue()
+
+
+def _steps(means: Floats) -> tuple[Floats, Floats, NDArray[np.uint16]]:
+    """Return the bounds [3] of the logarithms of centres [N, 3], and the steps between them."""
+    logs = np.sign(means) * np.log1p(np.abs(means))  # [N, 3]
+    mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if len(means) else (np.zeros(3), np.zeros(3))
+    return mins, maxs, np.rint(65535 * (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0)).astype(np.uint16)
 
 
 def _image(values: NDArray, width: int) -> Image.Image:
@@ -150,27 +160,83 @@ def _codebook(values: Floats) -> tuple[list[float], NDArray[np.uint8]]:
     return book.tolist(), indices.astype(np.uint8)
 
 
-def _palette(rows: Floats) -> tuple[Floats, Ints]:
-    """Return at most 65,536 rows [M, D] that represent rows [N, D], and the index of the one for each."""
-    n, n_columns = rows.shape
+def _palette(sh_rest: Floats, order: Ints) -> tuple[Floats, Ints]:
+    """Return at most 65,536 rows [M, 3 (K-1)] that represent harmonics, and the index [N] of the one for each.
+
+    Parameters
+    ----------
+    sh_rest : ndarray of shape (N, K-1, 3)
+    order : ndarray of shape (N,)
+        Rows in the order of the file. Of more than :data:`SAMPLES_MAX`, the tree is that of a sample, which is evenly
+        spaced in this order and hence in space; all rows then go down the tree to a leaf.
+    """
+    n, n_columns = len(order), 3 * sh_rest.shape[1]
+    samples = sh_rest[order[:: -(-n // SAMPLES_MAX)]].astype(np.float64).reshape(-1, n_columns)
     if n <= PALETTE_MAX:
-        return rows, np.arange(n)
+        return samples, np.arange(n)
+    labels, cuts = _halve(samples)
+    sums, counts = _sum_leaves(samples, labels)
+    if n <= SAMPLES_MAX:
+        return sums / counts[:, None], labels
+    palette = sums / counts[:, None]  # for leaves that no row gets into
+    labels = np.empty(n, np.int64)
+    sums[:], counts[:] = 0, 0
+    for part in pieces(n, "choosing entries"):
+        rows = sh_rest[order[part]].astype(np.float64).reshape(-1, n_columns)
+        labels[part] = _go_down(rows, cuts)
+        of_part = _sum_leaves(rows, labels[part])
+        sums += of_part[0]
+        counts += of_part[1]
+    is_used = counts > 0
+    palette[is_used] = sums[is_used] / counts[is_used, None]
+    return palette, labels
+
+
+class _Cut(NamedTuple):
+    """The halving of all nodes of one depth of a tree."""
+
+    columns: Ints
+    """[nodes] the coefficient along which each is halved."""
+    begins: Floats
+    """[nodes] where its upper half begins."""
+
+
+def _halve(rows: Floats) -> tuple[Ints, list[_Cut]]:
+    """Return the leaf [N] of each of more than 65,536 rows [N, D], and the cuts that lead there."""
+    n, n_columns = rows.shape
     nodes, n_nodes = np.zeros(n, np.int64), 1
-    while n_nodes < PALETTE_MAX:
+    cuts = []
+    for _ in with_progress(range(PALETTE_MAX.bit_length() - 1), "halving", "levels"):
         counts = np.bincount(nodes, minlength=n_nodes)
         variances = np.empty((n_columns, n_nodes))
         for column, values in zip(variances, rows.T, strict=True):
             mean = np.bincount(nodes, values, n_nodes) / counts
             column[:] = np.bincount(nodes, (values - mean[nodes]) ** 2, n_nodes)
-        along = np.take_along_axis(rows, variances.argmax(axis=0)[nodes][:, None], axis=1)[:, 0]  # [N]
+        columns = variances.argmax(axis=0)
+        along = np.take_along_axis(rows, columns[nodes][:, None], axis=1)[:, 0]  # [N]
         order = np.lexsort((along, nodes))
         begins = np.cumsum(counts) - counts
         ranks = np.arange(n) - begins[nodes[order]]
         is_upper = np.empty(n, np.int64)
         is_upper[order] = 2 * ranks >= counts[nodes[order]]
+        cuts.append(_Cut(columns, along[order[begins + (counts + 1) // 2]]))
         nodes, n_nodes = 2 * nodes + is_upper, 2 * n_nodes
-    counts = np.bincount(nodes, minlength=n_nodes)
-    return np.stack([np.bincount(nodes, values, n_nodes) / counts for values in rows.T], axis=1), nodes
+    return nodes, cuts
+
+
+def _go_down(rows: Floats, cuts: list[_Cut]) -> Ints:
+    """Return the leaf [N] that each of some rows [N, D] belongs to."""
+    nodes = np.zeros(len(rows), np.int64)
+    for cut in cuts:
+        along = np.take_along_axis(rows, cut.columns[nodes][:, None], axis=1)[:, 0]
+        nodes = 2 * nodes + (along >= cut.begins[nodes])
+    return nodes
+
+
+def _sum_leaves(rows: Floats, labels: Ints) -> tuple[Floats, Ints]:
+    """Return the sums [65,536, D] of the rows of each leaf, and their numbers [65,536]."""
+    counts = np.bincount(labels, minlength=PALETTE_MAX)
+    return np.stack([np.bincount(labels, values, PALETTE_MAX) for values in rows.T], axis=1), counts
 
 
 def decode(content: bytes, source: str | Path) -> Gaussians:

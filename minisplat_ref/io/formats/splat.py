@@ -22,6 +22,7 @@ from minisplat_ref.io.formats import Format
 from minisplat_ref.io.formats.levels8 import (
     WAY_OUT,
     check_float32,
+    check_scales,
     color_bytes,
     decode_logits,
     decode_sh_dc,
@@ -29,6 +30,7 @@ from minisplat_ref.io.formats.levels8 import (
     finite_scales,
     opacity_bytes,
 )
+from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.types import Gaussians
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -43,15 +45,18 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         A value is not finite, or a scale is beyond float32.
     """
     check_float32(gaussians)
-    rows = np.empty(len(gaussians.means), ROW)
-    rows["scales"] = finite_scales(gaussians)
+    check_scales(gaussians)
     if gaussians.sh_rest.size:
         warnings.warn(".splat holds no harmonics above degree 0: they are left out", InputWarning, stacklevel=2)
-    rows["means"] = gaussians.means
-    rows["rgba"][:, :3] = color_bytes(gaussians.sh_dc)
-    rows["rgba"][:, 3] = opacity_bytes(gaussians.opacity_logits)
-    unit = gaussians.quats / np.linalg.norm(gaussians.quats.astype(np.float64), axis=1, keepdims=True)
-    rows["quats"] = np.clip(np.floor(128.0 * unit + 128.5), 0, 255)
+    rows = np.empty(len(gaussians.means), ROW)
+    for part in pieces(len(rows)):
+        piece = Gaussians(*(field[part] for field in gaussians))
+        rows["scales"][part] = finite_scales(piece)
+        rows["means"][part] = piece.means
+        rows["rgba"][part, :3] = color_bytes(piece.sh_dc)
+        rows["rgba"][part, 3] = opacity_bytes(piece.opacity_logits)
+        unit = piece.quats / np.linalg.norm(piece.quats.astype(np.float64), axis=1, keepdims=True)
+        rows["quats"][part] = np.clip(np.floor(128.0 * unit + 128.5), 0, 255)
     return rows.tobytes()
 
 

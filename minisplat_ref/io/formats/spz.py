@@ -49,6 +49,8 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.formats import Format, spz_streams
 from minisplat_ref.io.formats.axes import AXES, OURS, check_axes, describe_axes, ours_from, turn
+from minisplat_ref.io.packing.deflating import gzip_compressor
+from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
@@ -109,35 +111,43 @@ def encode(gaussians: Gaussians, level: int, axes: str = SPECIFIED) -> bytes:
     """
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
-    gaussians = turn(gaussians, ours_from(axes).T)
-    means = gaussians.means.astype(np.float64)
-    fractional_bits = _fractional_bits(means, gaussians.log_scales)
-    steps = np.floor(means * 2.0**fractional_bits + 0.5)  # [N, 3]
-    opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
-    quats = gaussians.quats.astype(np.float64)
-    sh_rest = 128.0 * gaussians.sh_rest  # [N, K-1, 3]
-    version = VERSIONS[level]
-    parts = (
-        steps.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
-        _to_bytes(255.0 * opacities),
-        _to_bytes(255.0 * (COLOR_SCALE * gaussians.sh_dc.astype(np.float64) + 0.5)),
-        _to_bytes(16.0 * (gaussians.log_scales.astype(np.float64) + 10.0)),
-        _to_vector(quats) if version == 2 else _to_smallest_three(quats),
-        _to_buckets(sh_rest),
-    )
-    sh_degree = math.isqrt(n_rest + 1) - 1
+    to_file = ours_from(axes).T
+    fractional_bits = _fractional_bits(gaussians.means.astype(np.float64), gaussians.log_scales)
+    sh_degree, version = math.isqrt(n_rest + 1) - 1, VERSIONS[level]
+    header = _Header(version, n, sh_degree, fractional_bits, axes)
+    parts = {name: np.empty((n, size), np.uint8) for name, size in header.sizes.items()}
+    for part in pieces(n):
+        rows = turn(Gaussians(*(field[part] for field in gaussians)), to_file)
+        for values, into in zip(_encode_rows(rows, header), parts.values(), strict=True):
+            into[part] = values.reshape(into[part].shape)
     if version == spz_streams.VERSION:
         record = b"" if axes == SPECIFIED else RECORD.pack(COORDINATE_SYSTEM, 4) + _NUMBER.pack(AXES.index(axes) + 1)
-        return spz_streams.pack(n, sh_degree, fractional_bits, (part.tobytes() for part in parts), record)
-    header = HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0)
-    compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
-    content = header + b"".join(part.tobytes() for part in parts)
-    packed = []
-    with progress_bar("packing", "MB", len(content)) as bar:
-        for i in range(0, len(content), BLOCK):
-            packed.append(compressor.compress(content[i : i + BLOCK]))
-            bar.update(len(content[i : i + BLOCK]))
+        return spz_streams.pack(n, sh_degree, fractional_bits, (part.tobytes() for part in parts.values()), record)
+    n_bytes = HEADER.size + sum(part.nbytes for part in parts.values())
+    compressor = gzip_compressor(n_bytes)
+    packed = [compressor.compress(HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0))]
+    with progress_bar("packing", "MB", n_bytes) as bar:
+        for values in parts.values():
+            flat = values.reshape(-1).data
+            for i in range(0, len(flat), BLOCK):
+                packed.append(compressor.compress(flat[i : i + BLOCK]))
+                bar.update(len(flat[i : i + BLOCK]))
     return b"".join([*packed, compressor.flush()])
+
+
+def _encode_rows(rows: Gaussians, header: _Header) -> tuple[NDArray, ...]:
+    """Return the bytes of Gaussians in the axes of the file, attribute by attribute in its order."""
+    steps = np.floor(rows.means.astype(np.float64) * 2.0**header.fractional_bits + 0.5)  # [n, 3]
+    opacities = 0.5 * (1.0 + np.tanh(0.5 * rows.opacity_logits.astype(np.float64)))  # the sigmoid
+    quats = rows.quats.astype(np.float64)
+    return (
+        steps.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
+        _to_bytes(255.0 * opacities),
+        _to_bytes(255.0 * (COLOR_SCALE * rows.sh_dc.astype(np.float64) + 0.5)),
+        _to_bytes(16.0 * (rows.log_scales.astype(np.float64) + 10.0)),
+        _to_vector(quats) if header.version == 2 else _to_smallest_three(quats).view(np.uint8),
+        _to_buckets(128.0 * rows.sh_rest),
+    )
 
 
 def _fractional_bits(means: Floats, log_scales: Floats) -> int:

@@ -62,11 +62,13 @@ def pack(n: int, sh_degree: int, fractional_bits: int, parts: Iterable[bytes], r
     InputError
         zstandard is not installed.
     """
-    parts = list(parts)
-    frames = [pack_frame(part) for part in parts]
+    frames, sizes = [], []
+    for part in parts:
+        frames.append(pack_frame(part))
+        sizes.append(len(part))
     flags, begin = HAS_RECORDS if records else 0, HEADER.size + len(records)
-    header = HEADER.pack(MAGIC, VERSION, n, sh_degree, fractional_bits, flags, len(parts), begin)
-    table = [ENTRY.pack(len(frame), len(part)) for frame, part in zip(frames, parts, strict=True)]
+    header = HEADER.pack(MAGIC, VERSION, n, sh_degree, fractional_bits, flags, len(frames), begin)
+    table = [ENTRY.pack(len(frame), size) for frame, size in zip(frames, sizes, strict=True)]
     return b"".join([header, records, *table, *frames])
 
 

@@ -14,12 +14,14 @@ zstandard frame has blocks of at least 4 bytes (3 of header, 1 of content), each
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.json_file import parse_json
 from minisplat_ref.io.label import Label, from_json, to_json
 
@@ -30,8 +32,11 @@ LEVEL = 19  # the source of all other parameters
 HEADER_MAX = 1 << 16  # bytes
 LABEL = "label"  # the entry of a header that names the file's renderer
 RATIO_MAX = 1 << 15  # bytes made of one packed byte: 2^17 of 4
+AT_ONCE = 1 << 25  # bytes; of longer streams, which take seconds, a bar shows the progress, at other packed bytes
+BLOCK = 1 << 20  # bytes between two moves of the bar
 UNKNOWN_SIZE = -1  # of a frame that was written as a stream
 WAY_OUT = "copy or export the file again"
+Buffer = bytes | memoryview
 _PREFIX = struct.Struct("<4sHI")
 
 
@@ -64,7 +69,7 @@ def _zstandard() -> Any:
     return zstandard
 
 
-def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, bytes]) -> bytes:
+def pack(container: Container, header: Mapping[str, Any], streams: Iterable[tuple[str, Buffer]]) -> bytes:
     """Return the content of a file.
 
     Parameters
@@ -73,8 +78,8 @@ def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, 
         Magic and version.
     header : mapping
         JSON values; less than 64 KiB of text.
-    streams : mapping of str to bytes
-        The streams before packing.
+    streams : iterable of pairs of str and bytes
+        The names of the streams, and the streams before packing; each is let go before the next is asked for.
 
     Raises
     ------
@@ -86,12 +91,30 @@ def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, 
         LEVEL, strategy=zstandard.STRATEGY_BTULTRA2, write_checksum=True, write_content_size=True, **PARAMETERS
     )
     compressor = zstandard.ZstdCompressor(compression_params=parameters)
-    frames = {name: compressor.compress(raw) for name, raw in streams.items()}
-    sizes = [[name, len(frame)] for name, frame in frames.items()]
+    frames: dict[str, list[bytes]] = {}
+    for name, raw in streams:
+        frames[name] = _compress(compressor, name, raw)
+        del raw  # before the next one is made
+    sizes = [[name, sum(map(len, parts))] for name, parts in frames.items()]
     text = json.dumps({**header, "streams": sizes}, separators=(",", ":")).encode()
     assert len(text) <= HEADER_MAX
     prefix = _PREFIX.pack(container.magic, container.version, len(text))
-    return b"".join([prefix, text, *frames.values()])
+    return b"".join([prefix, text, *chain.from_iterable(frames.values())])
+
+
+def _compress(compressor: Any, name: str, raw: Buffer) -> list[bytes]:
+    """Return the parts of a frame of bytes, with a bar of progress; the name is that of the stream."""
+    content = memoryview(raw)
+    if len(content) <= AT_ONCE:
+        return [compressor.compress(content)]
+    frame = compressor.compressobj(size=len(content))
+    packed = []
+    with progress_bar(f"packing {name}", "MB", len(content)) as bar:
+        for start in range(0, len(content), BLOCK):
+            block = content[start : start + BLOCK]
+            packed.append(frame.compress(block))
+            bar.update(len(block))
+    return [*packed, frame.flush()]
 
 
 def pack_frame(raw: bytes) -> bytes:
@@ -102,7 +125,7 @@ def pack_frame(raw: bytes) -> bytes:
     InputError
         zstandard is not installed.
     """
-    return bytes(_zstandard().ZstdCompressor(level=LEVEL).compress(raw))
+    return b"".join(_compress(_zstandard().ZstdCompressor(level=LEVEL), "stream", raw))
 
 
 def parse(container: Container, content: bytes, source: str | Path) -> Packed:

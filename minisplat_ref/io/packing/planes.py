@@ -22,12 +22,23 @@ def unzigzag(values: NDArray[np.uint64]) -> Ints:
     return (values >> np.uint64(1)).view(np.int64) ^ -(values & np.uint64(1)).view(np.int64)
 
 
+def count_planes(largest: int) -> int:
+    """Return the number of planes that integers up to ``largest`` need, at least one."""
+    return max(1, -(-largest.bit_length() // 8))
+
+
+def put_planes(planes: NDArray[np.uint8], rows: slice, values: NDArray[np.uint64]) -> None:
+    """Store the integers [n, C] of some rows in planes [P, C, N]."""
+    columns = np.ascontiguousarray(values.T)  # [C, n]
+    for p, plane in enumerate(planes):
+        plane[:, rows] = (columns >> np.uint64(8 * p)) & np.uint64(255)
+
+
 def to_planes(values: NDArray[np.uint64]) -> tuple[bytes, int]:
     """Return the integers [N, C] as bytes [P, C, N], and the number of planes P that the largest one needs."""
-    n_planes = max(1, -(-int(values.max(initial=0)).bit_length() // 8))
-    columns = np.ascontiguousarray(values.T)  # [C, N]
-    planes = [((columns >> np.uint64(8 * p)) & np.uint64(255)).astype(np.uint8) for p in range(n_planes)]
-    return b"".join(plane.tobytes() for plane in planes), n_planes
+    planes = np.empty((count_planes(int(values.max(initial=0))), values.shape[1], len(values)), np.uint8)
+    put_planes(planes, slice(None), values)
+    return planes.tobytes(), len(planes)
 
 
 def from_planes(raw: bytes, n_planes: int, n_columns: int, n: int) -> NDArray[np.uint64]:

@@ -39,6 +39,10 @@ def one():
     )
 
 
+def page_of(title, gaussians, views):
+    return b"".join(write_page(title, gaussians, views, BACKGROUND)).decode()
+
+
 def test_arrays_by_hand():
     header, content = pack(one())
     raw = gzip.decompress(content)
@@ -66,7 +70,7 @@ def camera():
 
 
 def test_a_page_holds_its_cameras_and_loads_nothing():
-    page = write_page("<fox> & co", one(), [Viewpoint("</script>", camera(), "train")], BACKGROUND)
+    page = page_of("<fox> & co", one(), [Viewpoint("</script>", camera(), "train")])
     assert "<title>&lt;fox&gt; &amp; co</title>" in page
     assert not re.findall(r"(?:src|href)=|https?:", page)
     scene, _ = parts(page)
@@ -136,9 +140,9 @@ def test_a_browser_shows_what_we_render(tmp_path):
     output, _ = render(gaussians, camera(), background=BACKGROUND, backend=REFERENCE)
     ours = np.clip(output.image, 0.0, 1.0)
     views = [Viewpoint("0001", camera(), "train")]
-    (tmp_path / "right.html").write_text(write_page("right", gaussians, views, BACKGROUND))
+    (tmp_path / "right.html").write_text(page_of("right", gaussians, views))
     xyzw = gaussians._replace(quats=np.roll(gaussians.quats, -1, axis=1))
-    (tmp_path / "wrong.html").write_text(write_page("wrong", xyzw, views, BACKGROUND))
+    (tmp_path / "wrong.html").write_text(page_of("wrong", xyzw, views))
     with Browser(program, tmp_path / "profile", WEBGL) as browser:
         right = psnr(picture(browser, tmp_path / "right.html"), ours)
         assert right > PSNR_MIN

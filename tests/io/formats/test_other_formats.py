@@ -244,7 +244,7 @@ def test_sog_palette_of_many(monkeypatch):
     rng = np.random.default_rng(2)
     kinds = rng.normal(size=(60, 9))
     rows = kinds[rng.integers(0, 60, 1000)] + rng.normal(0, 1e-3, (1000, 9))
-    palette, labels = sog._palette(rows)
+    palette, labels = sog._palette(rows.reshape(1000, 3, 3), np.arange(1000))
     assert palette.shape == (64, 9) and {*np.bincount(labels, minlength=64).tolist()} == {15, 16}  # 1000 halved 6 times
     assert np.mean((palette[labels] - rows) ** 2) < 0.5 * rows.var(axis=0).mean()
     gaussians = population(1000, 1)._replace(sh_rest=rows.reshape(1000, 3, 3).astype(np.float32))
