@@ -3,8 +3,13 @@
 A hand that holds a camera moves unevenly, so of neighbouring frames some are sharp and some are blurred. Sharpness is
 the mean square of the Laplacian of the brightness: between frames of one place it falls with blur, while values of
 different places cannot be compared.
+
+Each frame that is stored counts once. Phones film at a variable rate, and ffmpeg by itself would repeat frames until
+the rate is constant. Frames whose pixels are no squares, as in DV, AVCHD or anamorphic films, are enlarged along one
+side, because a camera of one focal length has square ones.
 """
 
+import logging
 import re
 from collections.abc import Iterator
 from contextlib import closing
@@ -23,6 +28,7 @@ from minisplat_ref.io.images import DAMAGE_ERRORS, write_image
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".gif")
 AUDIO, PICTURE = re.compile(r"Stream #\S+.*: Audio:"), re.compile(r"Stream #\S+.*: Video:")
 CAUSE = re.compile(r"moov atom not found|Invalid data found when processing input|No such file or directory", re.I)
+SQUARE_PIXELS = "scale=w='if(gt(sar,1),round(iw*sar),iw)':h='if(lt(sar,1),round(ih/sar),ih)',setsar=1"
 SECONDS = 0.5  # of a video, from which one frame is kept
 
 
@@ -32,7 +38,7 @@ def is_video(path: Path) -> bool:
 
 
 def keep_sharpest(video: Path, folder: Path, every: int | None = None) -> list[Path]:
-    """Write the sharpest of every few frames into a folder, as ``frame_00017.png`` by their numbers.
+    """Write the sharpest of every few frames into a folder, with square pixels, as ``frame_00017.png``.
 
     Parameters
     ----------
@@ -84,13 +90,22 @@ def _read(video: Path, every: int | None) -> tuple[Iterator[NDArray[np.uint8]], 
         raise InputError(
             f"{video}: videos need ffmpeg: pip install 'minisplat_ref[video]', or give a folder of frames"
         ) from None
-    stream: Any = imageio_ffmpeg.read_frames(str(video))
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns of sizes that are changed on purpose
+    once = _each_frame_once(imageio_ffmpeg.get_ffmpeg_version())
+    stream: Any = imageio_ffmpeg.read_frames(str(video), output_params=[*once, "-vf", SQUARE_PIXELS])
     try:
         about = next(stream)  # of the whole video; frames follow
     except (*DAMAGE_ERRORS, StopIteration) as error:
         raise InputError(f"{video}: {_reason(str(error), video)}; export it as MP4") from error
     per_second = max(float(about["fps"]), 1.0)
     return _frames(stream, about["size"], video), max(1, round(SECONDS * per_second)) if every is None else every
+
+
+def _each_frame_once(version: str) -> list[str]:
+    """Return the options of an ffmpeg for frames that are neither repeated nor left out."""
+    found = re.match(r"\D*(\d+)", version)
+    is_old = found is not None and int(found[1]) < 6  # 5.1 has both options, 8 has lost the older one
+    return ["-vsync", "0"] if is_old else ["-fps_mode", "passthrough"]
 
 
 def _reason(log: str, video: Path) -> str:

@@ -1,5 +1,6 @@
 """Photographs from a video: the sharpest frame of each few, and the commands that take one."""
 
+import subprocess
 import sys
 
 import numpy as np
@@ -90,3 +91,86 @@ def test_what_is_no_video(clip, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["sfm", str(clip), "--out", str(tmp_path / "out")]) == 2
     assert "pip install 'minisplat_ref[video]'" in capsys.readouterr().err
+
+
+# what phones and older cameras record
+
+
+def make_clip(path, *options, filters="null", size=(64, 48)):
+    """Twelve gray frames, of 20, 40, ... 240, which a filter has changed, at six in a second."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    raw = b"".join(bytes([20 * (k + 1)]) * (3 * size[0] * size[1]) for k in range(N))
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(FPS), "-i", "-"]
+    command = [ffmpeg, "-loglevel", "error", "-y", *source, "-vf", filters, *options, str(path)]
+    subprocess.run(command, input=raw, check=True)
+    return path
+
+
+def grays(folder):
+    """The levels of all kept frames, to the nearest twenty."""
+    return [20 * round(read_image(path)[5:-5, 5:-5].mean() / 20) for path in sorted(folder.iterdir())]
+
+
+@pytest.mark.parametrize(
+    ("name", "times"),
+    [
+        ("slower.mp4", "if(lt(N,6),N,6+4*(N-6))"),  # the second half in the dark, at a quarter of the rate
+        ("uneven.mkv", "N+0.4*sin(5*N)"),
+        ("pause.mov", "if(lt(N,3),N,N+20)"),
+        ("faster.mp4", "if(lt(N,6),4*N,24+(N-6)/4)"),  # ffmpeg would leave some out
+        ("moving.gif", "if(lt(N,6),N,6+4*(N-6))"),
+    ],
+)
+def test_each_frame_of_a_variable_rate_counts_once(tmp_path, name, times):
+    codec = [] if name.endswith(".gif") else ["-c:v", "libx264", "-qp", "0", "-pix_fmt", "yuv444p"]
+    options = ("-fps_mode", "passthrough", "-enc_time_base", "1:1000", *codec)
+    clip = make_clip(tmp_path / name, *options, filters=f"settb=1/1000,setpts='1000*({times})/{FPS}'")
+    (tmp_path / "frames").mkdir()
+    kept = keep_sharpest(clip, tmp_path / "frames", 1)
+    assert [path.name for path in kept] == [f"frame_{k:05}.png" for k in range(N)]
+    assert grays(tmp_path / "frames") == [20 * (k + 1) for k in range(N)]
+
+
+@pytest.mark.parametrize(
+    ("name", "aspect", "expected"),
+    [
+        ("anamorphic.mp4", "4/3", (85, 48)),  # 64 x 4/3 = 85.3
+        ("dv.mov", "8/9", (64, 54)),
+        ("wide.mkv", "2/1", (128, 48)),
+        ("square.mp4", "1/1", (64, 48)),
+        ("unknown.mp4", "0/1", (64, 48)),
+    ],
+)
+def test_frames_have_square_pixels(tmp_path, name, aspect, expected, capfd):
+    clip = make_clip(tmp_path / name, "-c:v", "libx264", "-pix_fmt", "yuv420p", filters=f"setsar={aspect}")
+    (tmp_path / "frames").mkdir()
+    kept = keep_sharpest(clip, tmp_path / "frames", 4)
+    assert len(kept) == 3
+    assert {read_image(path).shape for path in kept} == {(expected[1], expected[0], 3)}
+    assert "frame size" not in capfd.readouterr().err
+
+
+def test_square_pixels_of_a_turned_video(tmp_path):
+    """A film of 64 x 48 that is shown upright: its pixels, wide when filmed, are high when shown."""
+    clip = make_clip(tmp_path / "a.mp4", "-c:v", "libx264", "-pix_fmt", "yuv420p", filters="setsar=3/2")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    turned = tmp_path / "turned.mp4"
+    command = [ffmpeg, "-loglevel", "error", "-display_rotation", "90", "-i", str(clip), "-c", "copy", str(turned)]
+    subprocess.run(command, check=True)
+    (tmp_path / "frames").mkdir()
+    kept = keep_sharpest(turned, tmp_path / "frames", 12)
+    assert read_image(kept[0]).shape == (96, 48, 3)
+
+
+@pytest.mark.parametrize(
+    ("version", "option"),
+    [
+        ("4.2.2-static", "-vsync"),
+        ("5.1", "-vsync"),
+        ("7.0.2-static", "-fps_mode"),
+        ("n9.0.2-17-g2a571b6068", "-fps_mode"),
+        ("N-109445-g7d49fef8b4", "-fps_mode"),
+    ],
+)
+def test_versions_of_ffmpeg_have_different_options(version, option):
+    assert video._each_frame_once(version)[0] == option
