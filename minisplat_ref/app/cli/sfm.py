@@ -97,6 +97,7 @@ def run(args: argparse.Namespace) -> int:
 def _summarize(result: "SfmResult", out: Path, matching: str) -> list[str]:
     """Return the lines that are printed."""
     from minisplat_ref.datasets.sfm import advice
+    from minisplat_ref.datasets.sfm.zoom import describe_found
 
     n_placed = result.n_photos - len(result.left_out)
     placed = f"{n_placed} of {result.n_photos} photographs ({n_placed / result.n_photos:.0%})"
@@ -110,8 +111,10 @@ def _summarize(result: "SfmResult", out: Path, matching: str) -> list[str]:
             lines.append(f"groups that fit together, but not with the scene: of {groups} photographs")
         lines.append(advice(matching))
     if len(result.groups) > 1:
-        cameras = "; ".join(f"{n} of {_describe_group(group)}" for group, n in result.groups.items())
+        cameras = "; ".join(f"{len(names)} of {_describe_group(group)}" for group, names in result.groups.items())
         lines.append(f"one camera for each size, camera and focal length: {cameras}")
+    if found := describe_found(result.groups):
+        lines.append(f"the focal length is in no EXIF data; the photographs show that it is {found}")
     if result.n_masks:
         lines.append(f"masks: of {result.n_masks} photographs; no features were looked for where they are black")
     return [*lines, _describe_exposures(out), *_propose_training(result, out)]
@@ -140,6 +143,7 @@ def _describe_group(group: "Group") -> str:
     """Return what the photographs of a group have in common."""
     parts = [f"{group.width} x {group.height}", group.camera]
     parts.append("" if group.focal is None else f"{group.focal:g} mm")
+    parts.append("" if group.found is None else f"{group.found:.2f} times the width")
     parts.append("" if group.focal_35 is None else f"{group.focal_35:g} mm on 35 mm film")
     return ", ".join(filter(None, parts))
 

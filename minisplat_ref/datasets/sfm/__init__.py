@@ -1,11 +1,13 @@
 """Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by COLMAP.
 
 Photographs are rotated upright and shrunk (:mod:`.photographs`), features are found and matched (:mod:`.features`), two
-mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. The result is a COLMAP
+mappers estimate cameras and points (:mod:`.mapping`), once more if photographs turn out to have been zoomed
+(:mod:`.zoom`), and the best result (:mod:`.judging`) is undistorted. The result is a COLMAP
 scene with pinhole cameras: ``images/``, ``sparse/0/``, and ``masks/`` if there were masks. Photographs that could not
 be placed are named and left out.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -23,6 +25,7 @@ from minisplat_ref.datasets.sfm.features import (
 from minisplat_ref.datasets.sfm.judging import Matches, choose, read_matches
 from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
 from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
+from minisplat_ref.datasets.sfm.zoom import copy_database, own_groups, split_groups
 from minisplat_ref.datasets.undistort import undistort_colmap
 from minisplat_ref.datasets.video import is_video, keep_sharpest
 from minisplat_ref.errors import InputError
@@ -30,6 +33,8 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos
 
 PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
+ROUNDS = 2  # in which photographs are told apart by their focal lengths, the second one with right cameras
+ZOOM_SHARE = 0.5  # of the photographs; with fewer placed, one camera for all of a size may be why
 POINTS_MIN = 150  # for each photograph; with fewer, dense features are tried
 
 
@@ -50,8 +55,8 @@ class SfmResult(NamedTuple):
     """The other results, without their models: of the other mapper, and of other features if they were tried."""
     n_matches: int
     """Verified matches, with which the results were judged."""
-    groups: dict[Group, int]
-    """Photographs that share a camera."""
+    groups: Mapping[Group, list[str]]
+    """Names of the photographs that share a camera."""
     n_masks: int
     """Photographs with a mask."""
     sizes: tuple[tuple[int, int], ...]
@@ -118,7 +123,7 @@ def run_sfm(
         n_photos = len(photographs.originals)
         if n_photos < 2:
             raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")
-        best, others, n_matches = _reconstruct(photographs, work, matching, features, camera_model)
+        best, others, n_matches, groups = _reconstruct(photographs, work, matching, features, camera_model)
         _check_placed(best, n_photos, photos, matching)
         (work / "sparse" / "0").mkdir(parents=True)
         best.model.write(work / "sparse" / "0")
@@ -132,7 +137,7 @@ def run_sfm(
         kept=best._replace(model=None),
         others=tuple(other._replace(model=None) for other in others),
         n_matches=n_matches,
-        groups={group: len(names) for group, names in photographs.groups.items()},
+        groups=groups,
         n_masks=len(photographs.masked),
         sizes=tuple((photo.camera.width, photo.camera.height) for photo in written),
     )
@@ -140,22 +145,45 @@ def run_sfm(
 
 def _reconstruct(
     photographs: Photographs, work: Path, matching: str, features: str, camera_model: str
-) -> tuple[Mapped, list[Mapped], int]:
-    """Return the best result, the others, and the number of matches with which they were judged."""
+) -> tuple[Mapped, list[Mapped], int, Mapping[Group, list[str]]]:
+    """Return the best result, the others, the number of matches they were judged with, and the groups of one camera."""
     all_pairs = pairs_to_match(list(photographs.originals), matching)
+    given = photographs.groups
+    n_photos = len(photographs.originals)
 
     def attempt(kind: Features, pairs: list[Pair]) -> tuple[list[Mapped], list[Matches]]:
+        nonlocal photographs
         folder = work / kind.name
         folder.mkdir()
         database = folder / "database.db"
         find_features(database, photographs, kind, camera_model)
         match_features(database, folder, pairs, kind)
-        n_photos = len(photographs.originals)
-        return map_photographs(database, photographs.images, folder, kind.name, n_photos), read_matches(database)
+
+        def remap(name: str, groups: dict[Group, list[str]]) -> list[Mapped]:
+            regrouped = folder / f"{name}.db"
+            copy_database(database, regrouped, photographs._replace(groups=groups), camera_model)
+            return map_photographs(regrouped, photographs.images, folder / name, kind.name, n_photos)
+
+        results = map_photographs(database, photographs.images, folder, kind.name, n_photos)
+        matches = read_matches(database)
+        best, others = choose(results, matches)
+        shown = best
+        if best.n_placed < ZOOM_SHARE * n_photos and (own := own_groups(photographs.groups)):
+            shown = max(remap("own", own), key=lambda result: result.n_placed)
+        kept = [best, *others]
+        for i in range(ROUNDS):
+            groups = split_groups(shown.model, given)
+            if {*map(tuple, groups.values())} == {*map(tuple, photographs.groups.values())}:
+                break
+            zoomed = remap(f"zoomed{i}", groups)
+            shown = max(zoomed, key=lambda result: result.n_placed)
+            if shown.n_placed < best.n_placed:
+                break
+            kept, photographs = zoomed, photographs._replace(groups=groups)
+        return kept, matches
 
     results, matches = attempt(STANDARD, all_pairs)
     best, others = choose(results, matches)
-    n_photos = len(photographs.originals)
     is_enough = best.n_placed == n_photos and best.n_points >= POINTS_MIN * n_photos
     if features == "dense" or (features == "auto" and not is_enough):
         images = [] if best.model is None else best.model.images.values()
@@ -163,7 +191,7 @@ def _reconstruct(
         pairs = overlapping_pairs(work / STANDARD.name / "database.db", all_pairs, placed)
         dense, matches = attempt(DENSE, pairs)
         best, others = choose(dense if features == "dense" else [best, *others, *dense], matches)
-    return best, others, sum(len(pair.first) for pair in matches)
+    return best, others, sum(len(pair.first) for pair in matches), photographs.groups
 
 
 def _check_placed(best: Mapped, n_photos: int, photos: Path, matching: str) -> None:

@@ -48,6 +48,8 @@ class Group(NamedTuple):
     """Focal length, mm, None if unknown."""
     focal_35: float | None
     """Focal length with the same angle of view on 35 mm film, mm, None if unknown."""
+    found: float | None = None
+    """Focal length in widths, where photographs of one group were told apart by it (:mod:`.zoom`)."""
 
 
 class Photographs(NamedTuple):
