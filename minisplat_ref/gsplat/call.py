@@ -57,8 +57,10 @@ def rasterization(
     tile_size: int = TILE_SIZE,
     backgrounds: Floats | None = None,
     render_mode: str = "RGB",
-    *,
+    sparse_grad: bool = False,
+    absgrad: bool = False,
     rasterize_mode: str = "classic",
+    *,
     covars: Floats | None = None,
     backend: str | Backend = "cpu",
     profile: str | Conventions = GSPLAT_MAIN,
@@ -102,6 +104,8 @@ def rasterization(
         Gaussians whose radii are both at most this, pixels, are culled.
     tile_size : int
         Of the meta's lists, pixels; images are the same.
+    sparse_grad, absgrad : bool
+        False alone.
     covars : ndarray of shape (N, 3, 3), optional
         Covariances instead of `quats` and `scales`, which are not read and may be None; of a matrix the upper triangle
         is read.
@@ -131,7 +135,7 @@ def rasterization(
         If an argument has a wrong shape, dtype or value, or requests something that is not computed. No Gaussians, or
         none in sight, is no error.
     """
-    check_refused("rasterization", others)
+    check_refused("rasterization", {"sparse_grad": sparse_grad, "absgrad": absgrad, **others})
     conventions = check.choose_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = _with_clip(get_backend(backend) if isinstance(backend, str) else backend, radius_clip)
     options = Options(sh_degree, render_mode, packed, tile_size, radius_clip)

@@ -358,12 +358,13 @@ def test_tiles_of_the_meta(size, rng):
 
 
 def test_arguments_by_position_are_those_of_gsplat(rng):
-    """In gsplat's order: planes, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode."""
+    """In the order of gsplat 1.5.3, from the planes to rasterize_mode."""
     call = make_call(rng)
     del call["sh_degree"]
     backgrounds = np.full((2, 3), 0.25)
     by_name = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 1.0, "eps2d": 0.2, "sh_degree": None}
     by_name |= {"packed": True, "tile_size": 8, "backgrounds": backgrounds, "render_mode": "RGB+D"}
+    by_name |= {"sparse_grad": False, "absgrad": False, "rasterize_mode": "antialiased"}
     (colors, alphas, meta), (others, other_alphas, other_meta) = (
         rasterization(**call, **by_name),
         rasterization(*call.values(), *by_name.values()),  # in the order of make_call
@@ -371,6 +372,9 @@ def test_arguments_by_position_are_those_of_gsplat(rng):
     assert_array_equal(colors, others)
     assert_array_equal(alphas, other_alphas)
     assert meta["tile_width"] == other_meta["tile_width"] and len(meta["depths"]) == len(other_meta["depths"])
+    assert not np.array_equal(colors, rasterization(**call, **by_name | {"rasterize_mode": "classic"})[0])
+    with pytest.raises(InputError, match="absgrad=True is not computed"):
+        rasterization(**call, **by_name | {"absgrad": True})
 
 
 @pytest.mark.parametrize("mode", ["D", "ED"])

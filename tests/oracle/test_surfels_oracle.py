@@ -195,3 +195,25 @@ def test_bad_input_is_one_line(arguments, message, capsys):
 def test_importing_the_oracle_of_surfels_imports_no_torch():
     code = "import sys, minisplat_ref.mechanisms.surfels.oracle.call; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_arguments_by_position_are_those_of_gsplat(known):
+    """In the order of gsplat 1.5.3, from the planes to depth_mode."""
+    given = known["ordinary"][0].arguments
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
+    first = [given[name] for name in names]
+    options = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 1.0, "eps2d": 0.3}
+    options |= {"sh_degree": given.get("sh_degree"), "packed": False, "tile_size": 8}
+    options |= {"backgrounds": given.get("backgrounds"), "render_mode": "RGB+ED"}
+    options |= {"sparse_grad": False, "absgrad": False, "distloss": True, "depth_mode": "median"}
+    by_position = rasterization_2dgs(*first, *options.values())
+    by_name = rasterization_2dgs(*first, **options)
+    for one, other in zip(by_position[:6], by_name[:6], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert by_position[4].any()  # the distortion
+    assert not np.array_equal(by_position[3], rasterization_2dgs(*first, **options | {"depth_mode": "expected"})[3])
+    for name in ("packed", "sparse_grad", "absgrad"):
+        with pytest.raises(InputError, match=f"{name}=True is not computed"):
+            rasterization_2dgs(*first, *(options | {name: True}).values())
+    with pytest.raises(TypeError, match="unexpected keyword argument"):
+        rasterization_2dgs(*first, camera_model="pinhole")

@@ -6,6 +6,7 @@ continue. So nothing is lost when a worker is killed: the scheduler hands its jo
 """
 
 import contextlib
+import re
 import signal
 import sys
 import threading
@@ -33,6 +34,8 @@ from minisplat_ref.errors import InputError
 CONNECT_SECONDS = 10.0  # for the scheduler to answer
 WORKER_SECONDS = 60.0  # for a first worker to come; of a batch system they come late
 SAVING_SECONDS = 120.0  # after Ctrl-C, for the running commands to save
+ADDRESS = re.compile(r"(?:(?:tcp|tls|wss?)://)?(?:\[[\da-fA-F:.]+\]|[^\s:/\[\]]+):(?P<port>\d{1,5})")
+PORT_MAX = 65535
 TOKEN = ".workers-"  # begins the name of a token
 REPORTED_CODES = (2, INTERRUPTED)  # after which the command has printed its line of explanation
 
@@ -175,6 +178,7 @@ def _connect(address: str) -> Any:
     import distributed
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # ours replace its messages of lost connections
+    _check_address(address)
     try:
         client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
@@ -182,11 +186,40 @@ def _connect(address: str) -> Any:
             f"no scheduler answers at {address}: start one with dask scheduler, and give the address that it prints"
         ) from error
     try:
+        if not client.scheduler_info()["workers"]:
+            print(
+                f"minisplat-ref: the scheduler at {address} has no workers yet: waiting for one, at most"
+                f" {WORKER_SECONDS:.0f} seconds",
+                file=sys.stderr,
+                flush=True,
+            )
         client.wait_for_workers(1, timeout=WORKER_SECONDS)
     except (OSError, TimeoutError) as error:
         client.close()
         raise InputError(f"the scheduler at {address} has no workers: start some with dask worker {address}") from error
     return client
+
+
+def _check_address(address: str) -> None:
+    """Refuse what is no address; Dask's client would leave threads behind that wait for it.
+
+    Raises
+    ------
+    InputError
+        It lacks its port, or has a protocol that is not spoken.
+    """
+    if (found := ADDRESS.fullmatch(address)) is None or int(found["port"]) > PORT_MAX:
+        raise InputError(
+            f"--cluster {address}: no address of a scheduler, which has a port: give one like tcp://localhost:8786, as"
+            " dask scheduler prints it"
+        )
+    from distributed.security import Security
+
+    if address.startswith(("tls:", "wss:")) and Security().get_connection_args("client").get("ssl_context") is None:
+        raise InputError(
+            f"--cluster {address}: it is encrypted, but Dask's configuration names no certificate: set"
+            " distributed.comm.tls, as for dask worker"
+        )
 
 
 @contextmanager

@@ -82,19 +82,22 @@ def rasterization_2dgs(
     Ks: Floats,
     width: int,
     height: int,
-    *,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
+    eps2d: float = 0.3,
     sh_degree: int | None = None,
+    packed: bool = False,
     tile_size: int = TILE_SIZE,
     backgrounds: Floats | None = None,
     render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
     distloss: bool = False,
     depth_mode: str = "expected",
+    *,
     backend: str | Backend = "cpu",
     steps: Steps = STEPS,
-    **others: Any,
 ) -> tuple[Floats, Floats, Floats, Floats | None, Floats, Floats, dict[str, Any]]:
     """Render surfels through C cameras.
 
@@ -115,9 +118,10 @@ def rasterization_2dgs(
         Implementation of the blending.
     steps : Steps
         For checks.
-    **others
-        gsplat's other keywords: ``eps2d`` has no effect there either; ``packed``, ``sparse_grad`` and ``absgrad`` are
-        taken as False alone.
+    eps2d : float
+        It has no effect in gsplat either.
+    packed, sparse_grad, absgrad : bool
+        False alone; the values are the same.
 
     Returns
     -------
@@ -138,6 +142,7 @@ def rasterization_2dgs(
     InputError
         If an argument has a wrong shape, dtype or value, or requests something that is not computed.
     """
+    others = {"packed": packed, "sparse_grad": sparse_grad, "absgrad": absgrad}
     settings = _check(distloss, render_mode, depth_mode, near_plane, far_plane, backend, steps, others)
     options = Options(sh_degree, render_mode, False, tile_size, radius_clip)
     views = Views(viewmats, Ks, width, height)

@@ -1,5 +1,6 @@
 """``compare --workers``: the same models as in turn, also after a worker is killed; what cannot work is one line."""
 
+import gc
 import json
 import os
 import signal
@@ -112,6 +113,43 @@ def test_no_scheduler_is_one_line(scene_folder, in_turn, tmp_path, capfd, monkey
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
     line = refused(scene_folder, tmp_path / "out", capfd, "--cluster", "tcp://127.0.0.1:9")
     assert "no scheduler answers at tcp://127.0.0.1:9: start one" in line
+
+
+@pytest.mark.parametrize(
+    "address", ["localhost", "127.0.0.1", ":::", "foo://localhost:8786", "tcp://localhost", "http://x", "h:99999"]
+)
+def test_what_is_no_address_is_one_line(scene_folder, tmp_path, capfd, address):
+    """Without it, Dask's client waits for twenty seconds at the end, and prints "Exception ignored in"."""
+    begin = time.monotonic()
+    line = refused(scene_folder, tmp_path / "out", capfd, "--cluster", address)
+    assert f"--cluster {address}: no address of a scheduler, which has a port: give one like tcp://localhost" in line
+    gc.collect()
+    assert capfd.readouterr().err == "" and time.monotonic() - begin < 15
+
+
+def test_encryption_without_a_certificate_is_one_line(scene_folder, tmp_path, capfd):
+    line = refused(scene_folder, tmp_path / "out", capfd, "--cluster", "tls://localhost:8786")
+    assert "--cluster tls://localhost:8786: it is encrypted" in line and "distributed.comm.tls" in line
+
+
+@pytest.mark.parametrize(
+    "address", ["localhost:8786", "tcp://10.0.0.1:1", "[::1]:8786", "tcp://[fe80::1]:65535", "a-b.c:80"]
+)
+def test_addresses_with_a_port_are_tried(address):
+    cluster._check_address(address)
+
+
+def test_without_workers_it_waits_with_a_line_and_a_limit(scene_folder, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(cluster, "WORKER_SECONDS", 1.0)
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=0, dashboard_address=None) as empty:
+        address = empty.scheduler_address
+        assert main(["compare", str(scene_folder), *OPTIONS, "--out", str(tmp_path / "out"), "--cluster", address]) == 2
+    waiting, refusal = [line for line in capfd.readouterr().err.splitlines() if line.startswith("minisplat-ref: ")]
+    assert f"the scheduler at {address} has no workers yet: waiting for one, at most 1 seconds" in waiting
+    assert f"the scheduler at {address} has no workers: start some with dask worker {address}" in refusal
+    assert not (tmp_path / "out").exists()
 
 
 def test_another_version_is_one_line(scene_folder, in_turn, tmp_path, capfd, monkeypatch):
