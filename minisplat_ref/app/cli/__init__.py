@@ -177,4 +177,14 @@ def _run(argv: Sequence[str]) -> int:
         return 0
     check_packages(getattr(args, "needs", ()))
     code: int = args.run(args)
+    if code == 0 and getattr(args, "recommends", False):
+        _print_how_to_call()
     return code
+
+
+def _print_how_to_call() -> None:
+    """Print what a shell needs before it finds the commands that were recommended."""
+    from minisplat_ref.app.reports.commands import how_to_call
+
+    for line in how_to_call():
+        print(line)

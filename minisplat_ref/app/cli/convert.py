@@ -141,6 +141,8 @@ def _share_axes(axes: str | None, path: Path, format_: "Format | None") -> "tupl
 def _write_page(args: argparse.Namespace) -> int:
     """Write the model as a page that shows it, and print how to open it."""
     from minisplat_ref.app.runs.model_source import open_source
+    from minisplat_ref.app.runs.run_folder import CONFIG, scene_title
+    from minisplat_ref.app.runs.settings import load
     from minisplat_ref.app.viewer.page import write_page
     from minisplat_ref.io.formats import write_content
     from minisplat_ref.rendering import SPLATTING
@@ -157,7 +159,7 @@ def _write_page(args: argparse.Namespace) -> int:
         raise InputError(
             f"{path} has {', '.join(further)}, which a page does not show: look at it with minisplat-ref view {path}"
         )
-    name = path.resolve().name
+    name = scene_title(Path(load(path).scene)) if path.is_dir() and (path / CONFIG).is_file() else path.resolve().name
     cameras = [view for view in source.cameras if view.split != "test"] or source.cameras
     write_content(out, write_page(name, population, cameras, trained.background))
     print(

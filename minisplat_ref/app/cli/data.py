@@ -29,7 +29,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("name", nargs="?", metavar="NAME", help="what to fetch (default: list what there is)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for it (default data/NAME)")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, recommends=True)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from minisplat_ref.app.cli.steps import do
+from minisplat_ref.app.cli.steps import make_page_and_film, print_results, show_made
 from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer
 from minisplat_ref.interface.progress import with_progress
 
@@ -21,8 +21,8 @@ DESCRIPTION = f"""\
 See the program work, with nothing to download: ray-trace photographs of a
 small room, train Gaussians on them (the first {ITERATIONS} iterations of recipe
 {RECIPE}), and measure views that the training never saw. It writes
-scene.html, which shows the room in any browser, and report.html: images, depth
-against the exact depth, curves, and what to try next.
+scene.html, which shows the room in any browser, film.gif, and report.html:
+images, depth against the exact depth, curves, and what to try next.
 
 Takes a minute or two on two cores. The folder that it leaves is a run like
 those of train, with the photographs in DIR/scene.
@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--iterations", type=integer(1), default=ITERATIONS, metavar="N", help=f"of the training (default {ITERATIONS})"
     )
-    parser.set_defaults(run=run, needs=("matplotlib",))
+    parser.set_defaults(run=run, needs=("matplotlib",), recommends=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,7 +53,6 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs import run_folder
     from minisplat_ref.app.runs.demo_report import report_html, view_images
     from minisplat_ref.app.runs.first_use import compile_kernels
-    from minisplat_ref.app.runs.next_steps import PAGE, live_view
     from minisplat_ref.app.runs.options import Settings
     from minisplat_ref.app.runs.preparation import prepare
     from minisplat_ref.app.runs.run import run_training
@@ -82,19 +81,19 @@ def run(args: argparse.Namespace) -> int:
     if outcome.evaluation is None:
         print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
         return 130
+    report = folder / run_folder.REPORT
+    shown = ""
+    if outcome.is_complete:
+        make_page_and_film(folder, folder)
+        shown = show_made(folder, report, folder)
     images = view_images(folder, synthetic, scene, outcome.evaluation)
-    page = report_html(folder, scene, settings, outcome, images, time.perf_counter() - start)
-    (folder / run_folder.REPORT).write_text(page, encoding="utf-8")
+    page = report_html(folder, scene, settings, outcome, images, shown, time.perf_counter() - start)
+    report.write_text(page, encoding="utf-8")
     if not outcome.is_complete:
-        report = folder / run_folder.REPORT
         print(f"minisplat-ref: stopped after {state.step} iterations, report of these: {report}", file=sys.stderr)
         return 130
     print(f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians")
-    do("convert", folder, folder / PAGE)
-    live = live_view(folder)
-    print(f"the room, in any browser: open {(folder / PAGE).resolve()}")
-    print(f"how good it is, and what to try next: open {(folder / run_folder.REPORT).resolve()}")
-    print(f"{live.purpose.lower()}: {live.line}")
+    print_results(folder, report, folder)
     return 0
 
 

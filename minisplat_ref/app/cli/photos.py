@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 
 from minisplat_ref.app.cli.sfm import MATCHINGS
-from minisplat_ref.app.cli.steps import do
+from minisplat_ref.app.cli.steps import do, make_page_and_film, print_results, show_made
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer, positive
 
-SCENE, RUN, PAGE, FILM = "scene", "run", "scene.html", "film.gif"
+SCENE, RUN = "scene", "run"
 
 DESCRIPTION = """\
 Make a 3D model of what photographs show: find their cameras, choose a size that
@@ -16,10 +16,10 @@ a laptop trains in minutes, train, and write a page that shows the scene in any
 browser, and a film along the photographer's path. It prints the command of each
 step, which can be given alone to choose more. DIR will hold:
 
-  scene/       the photographs with their cameras, a COLMAP scene (sfm)
-  run/         report.html, point_cloud.ply, metrics.json and more (train)
   scene.html   the scene, to look at offline and to send (convert)
-  film.gif     (render)
+  film.gif     along the path of the cameras (render)
+  run/         report.html, point_cloud.ply, metrics.json and more (train)
+  scene/       the photographs with their cameras, a COLMAP scene (sfm)
 
 Some 20 to 60 photographs of something that stands still, taken from places a
 step apart, with a lot of overlap, are a good start. After an interruption the
@@ -55,19 +55,18 @@ def add_parser(commands: Commands) -> None:
         metavar="M",
         help="exhaustive (default), or sequential (default of a video)",
     )
-    parser.set_defaults(run=run, needs=("matplotlib",))
+    parser.set_defaults(run=run, needs=("matplotlib",), recommends=True)
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the remaining steps, and print where their results are."""
-    from minisplat_ref.app.reports.commands import command
     from minisplat_ref.app.runs import run_folder, settings
-    from minisplat_ref.app.runs.next_steps import live_view
+    from minisplat_ref.app.runs.run_report import write_report
     from minisplat_ref.datasets.video import is_video
 
     path = args.photos.resolve()
     folder = args.out or Path("splats") / (path.stem if is_video(path) else path.name)
-    scene, trained, page, film = (folder / name for name in (SCENE, RUN, PAGE, FILM))
+    scene, trained = folder / SCENE, folder / RUN
     if not args.photos.is_dir() and not is_video(args.photos):
         raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")
     if not scene.exists():
@@ -83,15 +82,12 @@ def run(args: argparse.Namespace) -> int:
         code = 0
     if code != 0:
         return code
-    if not page.exists():
-        do("convert", trained, page)
-    if not film.exists():
-        do("render", trained, "--cameras", "orbit", "--film", film)
-    live = live_view(trained)
-    print(f"the scene, in any browser: open {page.resolve()}")
-    print(f"how good it is, and what to try next: open {(trained / run_folder.REPORT).resolve()}")
-    print(f"{live.purpose.lower()}: {live.line}")
-    print(f"make it smaller: {command('simplify', trained, '--out', folder / 'small')}")
+    report = trained / run_folder.REPORT
+    if make_page_and_film(trained, folder):
+        photographs, metrics = settings.load_photographs(settings.load(trained)), trained / run_folder.METRICS
+        shown = show_made(trained, report, folder)
+        write_report(trained, photographs, run_folder.read_json_object(metrics), shown)
+    print_results(trained, report, folder)
     return 0
 
 

@@ -73,7 +73,7 @@ def add_parser(commands: Commands) -> None:
         metavar="NAME",
         help="lens to estimate: SIMPLE_RADIAL (default), RADIAL or OPENCV",
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, recommends=True)
 
 
 def run(args: argparse.Namespace) -> int:

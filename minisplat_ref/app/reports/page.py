@@ -23,6 +23,7 @@ N_COLUMNS = 4  # of a table that fits on a phone; in one with more, or with a lo
 TALL = 60  # rows of a table that scrolls in the page instead of making it long
 PNG_PIXELS = 1 << 17  # of larger images a PNG would make the page heavy
 JPEG_QUALITY = 92
+FILM_QUALITY = 75  # of WebP
 
 
 def page(title: str, introduction: str, parts: Iterable[str]) -> str:
@@ -166,17 +167,39 @@ def slider(truth: Image8, renders: Mapping[str, Image8]) -> str:
 def add_caption(image: Image8, caption: str) -> str:
     """Return an image with a caption."""
     height, width = image.shape[:2]
+    return _figure(*_encode(image), width, height, caption)
+
+
+def film(frames: Sequence[Image8], fps: float, caption: str) -> str:
+    """Return a panel with a film of images of one size, which repeats without end."""
+    first, *others = map(Image.fromarray, frames)
+    file = io.BytesIO()
+    first.save(
+        file,
+        format="webp",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / fps),
+        loop=0,
+        quality=FILM_QUALITY,
+        method=4,
+    )
+    return f'<div class="panel">{_figure("webp", file.getvalue(), first.width, first.height, caption)}</div>'
+
+
+def _figure(kind: str, content: bytes, width: int, height: int, caption: str) -> str:
+    url = f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
     return (
-        f'<figure><img alt="{escape(caption)}" width="{width}" height="{height}" src="{_data_url(image)}">'
+        f'<figure><img alt="{escape(caption)}" width="{width}" height="{height}" src="{url}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
 
-def _data_url(image: Image8) -> str:
-    """Return the image in base64, a large one as JPEG with colours at full resolution."""
+def _encode(image: Image8) -> tuple[str, bytes]:
+    """Return the kind and the content of an image file, for a large image a JPEG with colours at full resolution."""
     is_large = image.shape[0] * image.shape[1] > PNG_PIXELS
     kind = "jpeg" if is_large else "png"
     options = {"quality": JPEG_QUALITY, "subsampling": 0} if is_large else {}
     file = io.BytesIO()
     Image.fromarray(image).save(file, format=kind, **options)
-    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+    return kind, file.getvalue()

@@ -30,6 +30,7 @@ h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; font-weight: 650 }
 h2 { font-size: 20px; margin: 48px 0 4px; font-weight: 600 }
 summary h2 { display: inline-block; cursor: pointer }
 p, ul { margin: 4px 0 16px; color: var(--soft); max-width: 74ch }
+a { color: var(--blue) }
 ul { padding-left: 20px; font-size: 15px }
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 24px 0 }
 .card, .panel { background: var(--panel); border: 1px solid var(--rule); border-radius: 10px }

@@ -46,7 +46,8 @@ def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = Fal
     has_schedule : bool
         Whether the recipe's length and rates are fixed.
     """
-    parts = [paragraph(story(pace, n_iterations, has_schedule=has_schedule))]
+    text = story(pace, n_iterations, has_schedule=has_schedule)
+    parts = [paragraph(text)] if text else []
     if pace.measurements:
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
         is_by_slope = any(_is_of_slope(decision) for decision in pace.decisions)
@@ -58,7 +59,7 @@ def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = Fal
 
 
 def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
-    """Return the decisions as sentences."""
+    """Return in sentences what the decisions rest on, and how the training ended."""
     n = len(pace.measurements)
     sentences = []
     if n:
@@ -71,7 +72,6 @@ def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
             f"{len(pace.measurements[0].psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}:"
             f" {', at twice the size '.join(rises)}."
         )
-    sentences += [f"{_date(d)} {DONE.get(d.what, d.what)}: {d.why}{_error(d)}." for d in pace.decisions]
     if has_schedule:
         return " ".join(sentences)
     if pace.cooling_from is None:
@@ -95,17 +95,10 @@ def _group_by_size(pace: Pace) -> list[tuple[Measurement, ...]]:
     return [part for part in parts if part]
 
 
-def _error(decision: Decision) -> str:
-    return "" if decision.standard_error is None else f" (standard error {decision.standard_error:.2f} dB)"
-
-
-def _date(decision: Decision) -> str:
-    return f"After iteration {decision.step:,}" if decision.step else "Before the first iteration"
-
-
 def _row(decision: Decision) -> list[str]:
+    effect = f": {DONE[decision.what]}" if decision.what in DONE else ""
     numbers = ["" if n is None else f"{n:.3f}" for n in (decision.gain, decision.standard_error)]
-    return [decision.what, f"{decision.step:,}", decision.why, *numbers]
+    return [f"{decision.what}{effect}", f"{decision.step:,}", decision.why, *numbers]
 
 
 def over_iterations(pace: Pace) -> Figure:

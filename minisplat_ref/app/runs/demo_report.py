@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref import __version__
-from minisplat_ref.app.reports.commands import command
+from minisplat_ref.app.reports.commands import command, how_to_call
 from minisplat_ref.app.reports.images import (
     Image8,
     colorize,
@@ -22,7 +22,6 @@ from minisplat_ref.app.reports.page import (
     cards,
     code,
     curves,
-    link,
     page,
     panel,
     paragraph,
@@ -31,7 +30,7 @@ from minisplat_ref.app.reports.page import (
     table,
 )
 from minisplat_ref.app.runs import run_folder
-from minisplat_ref.app.runs.next_steps import PAGE, live_view
+from minisplat_ref.app.runs.next_steps import live_view, own_photographs
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.report_parts import ERROR_TEXT, training_curves, view_panel
@@ -99,6 +98,7 @@ def report_html(
     settings: Settings,
     outcome: Outcome,
     images: list[ViewImages],
+    shown: str,
     total_seconds: float,
 ) -> str:
     """Return the page as text of one self-contained HTML file."""
@@ -139,12 +139,13 @@ def report_html(
         part for text, lines in _next_steps(folder, metrics["iterations"]) for part in (paragraph(text), code(lines))
     ]
     sections = [
+        *([shown] if shown else []),
         cards(key_figures),
         section("Held-out views", paragraph(VIEWS_TEXT), *map(_view_panel, images)),
         section("Depth", paragraph(DEPTH_TEXT), *map(_depth_panel, images)),
         section("How the training went", paragraph(CURVES_TEXT), curves(training_curves(log))),
         section("What was run", table(rows)),
-        section("What to try next", link("Look around the room in this browser.", PAGE), *steps),
+        section("What to try next", *map(paragraph, how_to_call()), *steps),
     ]
     return page("A room, rebuilt from photographs", introduction, sections)
 
@@ -169,9 +170,9 @@ def _depth_panel(view: ViewImages) -> str:
 
 def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
     """Return sentences, each with lines to copy."""
-    live = live_view(folder)
-    sfm, training = (command(*words) for words in (("sfm", "PHOTOS", "--out", "SCENE"), ("train", "SCENE")))
+    live, own = live_view(folder), own_photographs()
     return [
+        (f"{own.purpose}:", own.line),
         (f"{live.purpose}:", live.line),
         ("Walk around the room:", command("render", folder, "--cameras", "orbit", "--depth")),
         (
@@ -182,5 +183,4 @@ def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
             "Render the same views with the reference, which is NumPy and made to be read:",
             command("render", folder, "--backend", "reference", "--out", folder / "reference"),
         ),
-        ("Train on your own photographs; the first line finds out where they were taken from:", f"{sfm}\n{training}"),
     ]

@@ -26,6 +26,7 @@ DECISIONS = "decisions.json"  # measurements and decisions of a training that ma
 REPORT = "report.html"  # a report of all of it
 BLOCK_PLAN = "plan.png"  # the blocks seen from above
 BLOCKS = "blocks"  # the trainings of which it was merged, where it was trained in blocks
+FOLDER_OF_SCENE = "scene"  # in the folder of `photos` and of `demo`, which is the one that a person has named
 RENDERS = "renders"  # truth | render | error of each test view
 
 WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # files that have taken time; a run without any has not begun
@@ -89,6 +90,12 @@ def hold_folder(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def scene_title(scene: Path) -> str:
+    """Return the name of a scene by that of its folder, or of the folder in which ``photos`` and ``demo`` make it."""
+    folder = scene.resolve()
+    return folder.parent.name if folder.name == FOLDER_OF_SCENE else folder.name
 
 
 def create(folder: Path) -> None:

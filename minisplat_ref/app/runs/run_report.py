@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref import __version__
-from minisplat_ref.app.reports.commands import command
+from minisplat_ref.app.reports.commands import command, how_to_call
 from minisplat_ref.app.reports.images import fit_image, split_images
 from minisplat_ref.app.reports.page import add_caption, cards, code, curves, folded, page, paragraph, section, table
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.decisions_report import decisions_section
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
-from minisplat_ref.app.runs.next_steps import ways_to_look
+from minisplat_ref.app.runs.next_steps import own_photographs, ways_to_look
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.recipe_actions import Fired
@@ -40,7 +40,7 @@ What the recipe does besides gradient steps, in this run: how often, in how many
 many Gaussians their number rose or fell."""
 
 
-def write_report(folder: Path, scene: Scene, metrics: dict[str, Any]) -> None:
+def write_report(folder: Path, scene: Scene, metrics: dict[str, Any], shown: str = "") -> None:
     """Write the page of a run.
 
     Parameters
@@ -50,18 +50,20 @@ def write_report(folder: Path, scene: Scene, metrics: dict[str, Any]) -> None:
         That it was trained on.
     metrics : dict
         The content of ``metrics.json``, which is written after the page, since it marks the end of a run.
+    shown : str
+        The part that shows the scene (:func:`.report_parts.showcase`), if there is something to look at already.
 
     Raises
     ------
     InputError
         A file of the run is damaged, or the page cannot be written.
     """
-    text = report_html(folder, scene, metrics)
+    text = report_html(folder, scene, metrics, shown)
     with replacing(folder / run_folder.REPORT) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
+def report_html(folder: Path, scene: Scene, metrics: dict[str, Any], shown: str = "") -> str:
     """Return the page as text of one self-contained HTML file."""
     settings = load(folder)
     log, n_iterations = read_log(folder / run_folder.LOG), metrics["iterations"]
@@ -69,7 +71,7 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
         f"{metrics['n_gaussians']:,} Gaussians, trained for {n_iterations:,} iterations by the recipe {settings.recipe}"
         f" on {len(scene.train_views)} photographs."
     )
-    sections = [cards(_key_figures(metrics, log[0]["n_gaussians"] if log else None))]
+    sections = [*([shown] if shown else []), cards(_key_figures(metrics, log[0]["n_gaussians"] if log else None))]
     if metrics["per_view"]:
         sections.append(_views(folder, metrics["per_view"]))
     if (folder / run_folder.BLOCK_PLAN).exists():
@@ -87,9 +89,9 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
         sections.append(_fired(folder, settings, n_iterations))
     sections += [
         section("What was run", table(_settings(folder, settings, metrics, scene))),
-        section("What to do with it", *_next_steps(folder, settings)),
+        section("What to try next", *_next_steps(folder, settings, is_shown=bool(shown))),
     ]
-    return page(f"{scene.name}, trained", introduction, sections)
+    return page(run_folder.scene_title(Path(settings.scene)), introduction, sections)
 
 
 def _key_figures(metrics: dict[str, Any], n_first: int | None) -> list[tuple[str, str]]:
@@ -199,16 +201,18 @@ def _settings(folder: Path, settings: Settings, metrics: dict[str, Any], scene: 
     ]
 
 
-def _next_steps(folder: Path, settings: Settings) -> list[str]:
+def _next_steps(folder: Path, settings: Settings, *, is_shown: bool) -> list[str]:
     population = find_recipe(settings.recipe, extension=settings.extension).representation.population
+    looking = ways_to_look(folder, population._fields)
     steps = [
-        *((f"{step.purpose}:", step.line) for step in ways_to_look(folder, population._fields)),
+        *((f"{step.purpose}:", step.line) for step in (looking[-1:] if is_shown else looking)),  # the page is there
         ("Walk around the scene:", command("render", folder, "--cameras", "orbit")),
         ("Measure it again, or with LPIPS:", command("eval", folder)),
         ("Make it smaller, if that costs at most 0.1 dB:", _simplify(folder)),
         ("Pack it for a viewer on the web:", command("convert", folder, folder.parent / f"{folder.name}.spz")),
+        (f"{own_photographs().purpose}:", own_photographs().line),
     ]
-    return [part for text, line in steps for part in (paragraph(text), code(line))]
+    return [*map(paragraph, how_to_call()), *(part for text, line in steps for part in (paragraph(text), code(line)))]
 
 
 def _simplify(folder: Path) -> str:

@@ -1,13 +1,17 @@
 """``photos``: from photographs to a report and a film, what it prints, and that it continues."""
 
+import base64
 import re
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.app.cli import photos as photos_command
+from minisplat_ref.app.runs import next_steps
 from minisplat_ref.app.runs.proposed_size import comfortable_factor
 from run_commands import interrupt_at, write_room
 from textured_world import HEIGHT, WIDTH, take_photographs, write_photographs
@@ -42,11 +46,41 @@ def test_from_photographs_to_a_film(tmp_path, capsys):
     assert steps_of(printed) == ["sfm", "train", "convert", "render"]
     assert ": 9 of 9 photographs (100%)" in printed and f" of {WIDTH // 4} x {HEIGHT // 4}," in printed
     assert all((out / name).exists() for name in ("scene/sparse/0", "run/report.html", "run/metrics.json", "film.gif"))
-    page, report, live, smaller = printed.splitlines()[-4:]
-    assert page == f"the scene, in any browser: open {out / 'scene.html'}" and (out / "scene.html").exists()
-    assert report.endswith(f": open {out / 'run' / 'report.html'}")
-    assert live.endswith(f" view {out / 'run'}") and "pip install 'minisplat_ref[viewer]'" in live
+    page, film, report, live, surface, smaller, *_ = printed.rpartition("\n\n")[2].splitlines()
+    assert page == f"to look at, in any browser: open {out / 'scene.html'}", "what there is to see comes first"
+    assert film == f"a film: open {out / 'film.gif'}" and report.endswith(f": open {out / 'run' / 'report.html'}")
+    assert live.endswith(f" view {out / 'run'}") and surface.endswith(f" mesh {out / 'run'} --out {out / 'mesh.ply'}")
     assert smaller.startswith("make it smaller: ") and " simplify " in smaller
+    check_report_shows_the_scene(out / "run" / "report.html", out)
+    assert "<title>out</title>" in (out / "scene.html").read_text(), "the page has the name of the folder, too"
+
+
+def check_report_shows_the_scene(report, folder):
+    """It is named after the folder, links to the page, shows the film, and recommends what is left to do."""
+    text = report.read_text(encoding="utf-8")
+    assert f"<h1>{folder.name}</h1>" in text
+    (link,) = re.findall(r'<a href="(.*?)">', text)
+    assert (report.parent / link).resolve() == (folder / "scene.html").resolve()
+    (film,) = re.findall(r'src="data:image/webp;base64,(.*?)"', text)
+    with Image.open(BytesIO(base64.b64decode(film))) as shown, Image.open(folder / "film.gif") as written:
+        assert 80 < shown.n_frames <= 96, "equal ones are kept once"
+        assert shown.size == written.size
+    following = text.partition("What to try next")[2]
+    assert " view " in following and " photos PHOTOS" in following and "scene.html" not in following
+
+
+def test_extras_are_named_where_they_are_missing(out, capsys, monkeypatch):
+    assert photos(out, "--minutes", "0.1") == 0
+    capsys.readouterr()
+    missing = set()
+    monkeypatch.setattr(next_steps, "find_spec", lambda package: None if package in missing else package)
+    assert photos(out) == 0
+    assert "pip install" not in capsys.readouterr().out
+    missing |= {"viser", "skimage"}
+    assert photos(out) == 0
+    live, surface = [line for line in capsys.readouterr().out.splitlines() if "pip install" in line]
+    assert "'minisplat_ref[viewer]'): " in live and " view " in live
+    assert "'minisplat_ref[meshes]'): " in surface and " mesh " in surface
 
 
 def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):

@@ -95,6 +95,7 @@ def test_the_chain_of_the_readme_and_what_its_reports_recommend(capsys):
         assert {"render", "convert"} <= {words[0] for words in commands}
         if page.parts[1] == "mine":
             assert [words[0] for words in commands][:2] == ["convert", "view"], "how to look at it comes first"
+            assert commands.pop() == ["photos", "PHOTOS"], "on one's own photographs"
         run_all(commands, capsys)
     assert (Path("runs/mine-small") / "point_cloud.ply").exists(), "which the run's report recommends"
     assert Path("runs/mine.spz").exists() and Path("runs/small.spz").exists()
@@ -104,12 +105,13 @@ def test_what_the_demo_recommends(capsys, monkeypatch):
     """On a smaller scene, which the reference renders in time."""
     monkeypatch.setattr(demo, "SCENE", {**demo.SCENE, "width": 32, "height": 24, "n_points": 60, "n_views": 6})
     run_all([["demo", "--iterations", "5"]], capsys)
-    (page,) = Path().rglob("report.html")
-    looking = page.read_text(encoding="utf-8").partition("What to try next")[2]
-    assert looking.index('href="scene.html"') < looking.index("<pre") and page.with_name("scene.html").exists()
+    page = Path(demo.DEFAULT_OUT) / "report.html"
+    text = page.read_text(encoding="utf-8")
+    assert text.index('href="scene.html"') < text.index("data:image/webp") < text.index("Held-out views")
+    assert page.with_name("scene.html").exists()
     commands = recommended_in(page)
-    own = [words for words in commands if "PHOTOS" in words or "SCENE" in words]
-    assert own == [["sfm", "PHOTOS", "--out", "SCENE"], ["train", "SCENE"]], "on one's own photographs"
+    own = [words for words in commands if "PHOTOS" in words]
+    assert own == [["photos", "PHOTOS"]], "on one's own photographs"
     run_all([words for words in commands if words not in own], capsys)
 
 
