@@ -158,6 +158,12 @@ def add_renderer_arguments(parser: argparse._ActionsContainer) -> None:
         parser.add_argument(option, type=parse, choices=choices, metavar="NAME", help=text)
 
 
+def add_up_argument(parser: argparse._ActionsContainer) -> None:
+    """Add ``--up``, None where it is not given: a text for :func:`minisplat_ref.io.upright.given_up`."""
+    text = "what is up: X,Y,Z or NAME of a photograph (default: found)"
+    parser.add_argument("--up", type=name, metavar="U", help=text)
+
+
 def add_worker_arguments(
     parser: argparse.ArgumentParser,
     here: str = "train in N processes at once (default 0: in turn)",

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.io.upright import Y_DOWN, find_up
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.types import Camera, Floats
 
@@ -21,13 +22,18 @@ ELEVATION = math.radians(20.0)  # likewise
 FULL_CIRCLE = 2.0 * math.pi
 LARGEST_GAP = math.radians(90.0)  # between neighbouring cameras; a larger one is not crossed
 SMOOTHING = math.radians(15.0)  # standard deviation of the weights by which cameras near an angle count
-MEAN_UP_WEIGHT = 0.02  # against the spread of horizontal edges, which is 1/2 all around and 0.1 along 70 degrees
 RADIUS_MIN = 0.1  # of the median: the angle of a camera nearer to the axis is arbitrary
 PARALLEL = 0.9  # length of the mean viewing direction, from which on the axes may meet behind the cameras
 
 
 def orbit(
-    means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, height: int, arc: float | None = None
+    means: Floats,
+    like: Sequence[Viewpoint],
+    n_frames: int,
+    width: int,
+    height: int,
+    arc: float | None = None,
+    up: Floats | None = None,
 ) -> list[Viewpoint]:
     """Return the cameras of a closed path around the scene.
 
@@ -37,31 +43,39 @@ def orbit(
         Centres of the Gaussians, world frame.
     like : sequence of Viewpoint
         Training cameras, which the path follows. Without any, it is a circle around the median of the means, so wide
-        that nine tenths of them are in the image, with -y up (the y axis of COLMAP scenes points down).
+        that nine tenths of them are in the image.
     n_frames : int
         Number of cameras.
     width, height : int
         Image size, pixels.
     arc : float, optional
         Angle that the path covers, radians, centred on the middle of the training cameras. Less than a full circle is
-        travelled there and back. By default the angle that the training cameras cover, or the full circle.
+        travelled there and back. By default the angle that the training cameras cover, or the full circle, and the path
+        begins at one of them.
+    up : ndarray of shape (3,), optional
+        What is up, world frame; by default what :func:`.upright.find_up` finds, or without cameras -y (the y axis of
+        COLMAP scenes points down).
 
     Returns
     -------
     list of Viewpoint
         Named ``orbit_000`` onwards; the time goes once from 0 to 1 on the way.
     """
-    path = _path_of_cameras([view.camera for view in like], width) if like else _path_of_means(means, width, height)
+    cameras = [view.camera for view in like]
+    if up is None:
+        up = find_up(cameras, means).direction if cameras else Y_DOWN
+    path = _path_of_cameras(cameras, width, up) if cameras else _path_of_means(means, width, height, up)
     first, last = path.covered
     if arc is not None:
         middle = 0.5 * (first + last)
         first, last = (first, first + FULL_CIRCLE) if arc >= FULL_CIRCLE else (middle - 0.5 * arc, middle + 0.5 * arc)
+    begin = None if arc is not None or not cameras else _step_to_camera(path, first)
     viewpoints = []
     for frame in range(n_frames):
         time = frame / n_frames
         is_closed = last - first >= FULL_CIRCLE
         share = time if is_closed else 0.5 - 0.5 * math.cos(FULL_CIRCLE * time)  # slows down where it turns
-        position, forward = _place(path, first + share * (last - first))
+        position, forward = _place(path, first + share * (last - first), begin)
         rotation = _look_along(forward, path.up)
         camera = Camera(
             rotation, -rotation @ position, path.focal, path.focal, 0.5 * width, 0.5 * height, width, height
@@ -91,24 +105,53 @@ class _Path(NamedTuple):
     """Pixels."""
 
 
-def _place(path: _Path, angle: float) -> tuple[Floats, Floats]:
-    """Return the position [3] of the path at an angle, and the direction [3] that it looks in, world frame."""
-    distances = np.abs((path.angles - angle + math.pi) % FULL_CIRCLE - math.pi)  # [V]
-    exponents = -0.5 * (distances / SMOOTHING) ** 2
+class _Step(NamedTuple):
+    """From the path to a camera, at whose angle the path goes all the way, and near it a part."""
+
+    angle: float
+    place: Floats
+    """[2]"""
+    direction: Floats
+    """[3]"""
+
+
+def _step_to_camera(path: _Path, angle: float) -> _Step:
+    """Return the step to the camera that is nearest to an angle."""
+    nearest = int(_angular_distances(path, angle).argmin())
+    place, direction = _smooth(path, angle)
+    return _Step(angle, path.places[nearest] - place, path.directions[nearest] - direction)
+
+
+def _angular_distances(path: _Path, angle: float) -> Floats:
+    return np.abs((path.angles - angle + math.pi) % FULL_CIRCLE - math.pi)  # [V]
+
+
+def _smooth(path: _Path, angle: float) -> tuple[Floats, Floats]:
+    """Return distance and height [2], and direction [3], of the cameras near an angle, in the axes of the circle."""
+    exponents = -0.5 * (_angular_distances(path, angle) / SMOOTHING) ** 2  # [V]
     weights = np.exp(exponents - exponents.max())  # [V]
     weights /= weights.sum()
-    radius, height = weights @ path.places
+    return weights @ path.places, weights @ path.directions
+
+
+def _place(path: _Path, angle: float, begin: _Step | None) -> tuple[Floats, Floats]:
+    """Return the position [3] of the path at an angle, and the direction [3] that it looks in, world frame."""
+    place, direction = _smooth(path, angle)
+    if begin is not None:
+        away = (angle - begin.angle + math.pi) % FULL_CIRCLE - math.pi
+        share = math.exp(-0.5 * (away / SMOOTHING) ** 2)
+        place, direction = place + share * begin.place, direction + share * begin.direction
+    radius, height = place
     outwards = math.cos(angle) * path.start + math.sin(angle) * np.cross(path.up, path.start)  # [3]
     axes = np.stack([outwards, np.cross(path.up, outwards), path.up])  # [3, 3]
-    return path.target + radius * outwards + height * path.up, weights @ path.directions @ axes
+    return path.target + radius * outwards + height * path.up, direction @ axes
 
 
-def _path_of_cameras(cameras: Sequence[Camera], width: int) -> _Path:
+def _path_of_cameras(cameras: Sequence[Camera], width: int, up: Floats) -> _Path:
     rotations = np.array([camera.cam_from_world_R for camera in cameras])  # [V, 3, 3]
     centres = np.array([camera.center for camera in cameras])  # [V, 3]
     forwards = rotations[:, 2]  # [V, 3]
     target = nearest_to_axes(centres, forwards)
-    up = common_up(rotations)
     heights = (centres - target) @ up  # [V]
     radial = centres - target - heights[:, None] * up  # [V, 3]
     radii = np.linalg.norm(radial, axis=1)  # [V]
@@ -138,15 +181,6 @@ def nearest_to_axes(centres: Floats, forwards: Floats) -> Floats:
     return target + max(spread - float((target - middle) @ ahead), 0.0) * ahead
 
 
-def common_up(rotations: Floats) -> Floats:
-    """Return the direction [3] at a right angle to the horizontal edges of all images."""
-    rights, mean_up = rotations[:, 0], -rotations[:, 1].mean(axis=0)  # [V, 3], [3]
-    # The mean itself leans towards an arc of cameras that look down; it decides where all edges are parallel.
-    spread = rights.T @ rights / len(rights) - MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)  # [3, 3]
-    up = np.linalg.eigh(spread)[1][:, 0]  # of the smallest eigenvalue
-    return np.copysign(1.0, up @ mean_up) * up
-
-
 def _find_covered(angles: Floats) -> tuple[float, float]:
     """Return the first and last angle of the path: a full circle, or all but the largest gap between cameras."""
     ordered = np.sort(angles)
@@ -158,13 +192,12 @@ def _find_covered(angles: Floats) -> tuple[float, float]:
     return first, first + FULL_CIRCLE - float(gaps[widest])
 
 
-def _path_of_means(means: Floats, width: int, height: int) -> _Path:
+def _path_of_means(means: Floats, width: int, height: int, up: Floats) -> _Path:
     target = np.median(means, axis=0) if len(means) else np.zeros(3)  # [3]; floaters do not move a median
     offsets = means.astype(np.float64) - target  # [N, 3]
     reach = float(np.quantile(np.linalg.norm(offsets, axis=1), 0.9)) if len(means) else 1.0
     focal = 0.5 * width / math.tan(0.5 * FOV)
     distance = max(reach, 1e-6) / math.sin(math.atan(0.5 * min(width, height) / focal))
-    up = np.array([0.0, -1.0, 0.0])
     place = distance * np.array([[math.cos(ELEVATION), math.sin(ELEVATION)]])
     direction = np.array([[-math.cos(ELEVATION), 0.0, -math.sin(ELEVATION)]])
     return _Path(target, up, _perpendicular(up), np.zeros(1), place, direction, (0.0, FULL_CIRCLE), focal)

@@ -62,6 +62,11 @@ def run_sfm(photos, scene, *options):
     return main(["sfm", str(photos), "--out", str(scene), *options])
 
 
+def lines_of(printed):
+    """Return the lines, without the one about the shell, which is printed where the environment is not active."""
+    return [line for line in printed.splitlines() if not line.startswith("in a new terminal")]
+
+
 # against the truth
 
 
@@ -70,7 +75,8 @@ def test_two_focal_lengths_at_one_size(shots, tmp_path, capsys):
     assert run_sfm(tmp_path / "photos", tmp_path / "scene", "--features", "standard") == 0
     printed = capsys.readouterr()
     assert printed.err == ""  # no bars where there is no terminal
-    first, kept, other, groups, *_, following = printed.out.splitlines()
+    first, kept, other, groups, up, *_, following = lines_of(printed.out)
+    assert up.startswith("up is ") and up.endswith("(--up says it otherwise)")
     assert ": 12 of 12 photographs (100%), " in first and " points, reprojection error 0." in first
     assert kept.startswith("kept: ") and other.startswith("not kept: ")
     assert all(f"{mapper} mapper with standard features: 12 " in kept + other for mapper in mapping.MAPPERS)
@@ -147,7 +153,7 @@ def test_dense_features_where_points_are_few(shots, tmp_path, capsys):
     """24 photographs of 256 pixels give too few points for auto; dense finds more, and both results are named."""
     write_photographs(tmp_path / "photos", shots[:8:2], (None,) * 4)
     assert run_sfm(tmp_path / "photos", tmp_path / "scene") == 0
-    _, kept, *others, exposures, _, _ = capsys.readouterr().out.splitlines()
+    _, kept, *others, _, exposures, _, _ = lines_of(capsys.readouterr().out)
     assert exposures.startswith("exposures of the photographs ")
     assert "mapper with dense features: 4 photographs, " in kept
     assert [line.startswith("not kept: ") for line in others] == [True] * 3
@@ -292,7 +298,7 @@ def test_four_photographs(shared_data, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "4 of 4 photographs" in out and "dense" not in out and "groups" not in out
     check_banana(shared_data, tmp_path / "scene", 4)
-    assert sorted(path.name for path in (tmp_path / "scene").iterdir()) == ["images", "sparse"]
+    assert sorted(path.name for path in (tmp_path / "scene").iterdir()) == ["images", "sparse", "up.json"]
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from minisplat_ref.datasets.photo_files import list_images
+from minisplat_ref.datasets.sfm.level import upright_by_sensor
 from minisplat_ref.datasets.sfm.photographs import Group, find_mask, prepare_photos
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io.images import read_image, read_mask, write_image
@@ -166,3 +167,19 @@ def test_masks_that_fit_no_photograph(photos, tmp_path):
     write_image(photos / "masks" / "a.png", half(16, 24))
     with pytest.raises(InputError, match=r"a\.png: the mask is 16x24 but its photograph a\.jpg, upright, is 32x24"):
         prepare_photos(photos, tmp_path / "again", 40)
+
+
+# what is up
+
+
+def test_only_a_camera_that_once_said_otherwise_is_known_to_be_upright(photos, tmp_path):
+    """One phone turned a photograph; another camera writes 1 however it is held, and a third writes nothing."""
+    image = colored_image(1)
+    for name, model, orientation in (
+        ("a.jpg", "phone", 1),
+        ("b.jpg", "phone", 6),
+        ("c.jpg", "camera", 1),
+        ("d.jpg", None, None),
+    ):
+        save(photos / name, image, model=model, orientation=orientation)
+    assert upright_by_sensor(prepare_photos(photos, tmp_path, 100)) == {"a.jpg", "b.jpg"}

@@ -7,19 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.interface.arguments import Commands, HelpFormatter, decibels, integer
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, add_up_argument, decibels, integer
 
 if TYPE_CHECKING:
     from minisplat_ref.app.runs.conversion import Choice, Source
     from minisplat_ref.io.formats import Format
 
 DESCRIPTION = """\
-Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
-compact file. The suffix of OUT says what is written:
+Write the Gaussians of a run (if it has not ended, its newest whole checkpoint),
+a checkpoint.npz, a PLY or a compact file. The suffix of OUT says what is
+written:
 
   .ply    the 3DGS layout with every float
   .spz .sog .splat .glb .compressed.ply   for other programs
-  .msz    ours, with a stated error (see minisplat-ref extensions compression)
+  .msz    ours, with a stated error (minisplat-ref extensions compression)
   .html   one page to send, which shows the scene in a browser, offline
 
 Compact formats have levels of precision, of which 0 is the finest:
@@ -31,8 +32,6 @@ Compact formats have levels of precision, of which 0 is the finest:
 EPILOG = """\
 --axes is that of the .spz that is read, or written if none is: RUB by its
 specification, RDF (those of the PLY) in some programs.
-
-If a run has not ended, its newest whole checkpoint is converted.
 
 examples:
   minisplat-ref convert runs/fox fox.ply
@@ -66,6 +65,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--drop-outliers", action="store_true", help="leave out what is far from all others")
     parser.add_argument("--axes", metavar="A", help="of an .spz (default: what it names, or RUB)")
+    add_up_argument(parser)
     parser.set_defaults(run=run)
 
 
@@ -77,14 +77,19 @@ def run(args: argparse.Namespace) -> int:
         describe_dropped,
         drop_outliers,
         encode_as,
+        find_up_of,
+        make_upright,
         open_source,
     )
     from minisplat_ref.io.formats import mapped, write_file
+    from minisplat_ref.io.upright import describe_up
 
     out: Path = args.output
     if out.suffix.lower() == ".html":
         return _write_page(args)
     format_ = choose_format(out)
+    if args.up is not None and (format_ is None or format_.suffix != ".glb"):
+        raise InputError(f"--up is for pages (.html) and for .glb, in which y is up; {out.suffix} has the scene's axes")
     if args.max_drop is None and (args.scene is not None or args.downscale is not None):
         raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
     of_input, format_ = _share_axes(args.axes, args.input, format_)
@@ -108,6 +113,9 @@ def run(args: argparse.Namespace) -> int:
         check_population(source.model.gaussians, format_, source.what)
         format_ = format_._replace(encode=partial(encode_as, format_, out, source.label))
         choice, measured = _choose(args, source, format_)
+        if format_.suffix == ".glb" and (up := find_up_of(args.input, source.model.gaussians, args.up)) is not None:
+            print(describe_up(up))
+            choice = choice._replace(content=format_.encode(make_upright(source.model.gaussians, up), choice.level))
         write_file(out, format_, choice.content, source.label)
         content = choice.content if isinstance(choice.content, bytes) else mapped(out)
         rows = [*format_.describe(content, out), *measured]
@@ -145,6 +153,7 @@ def _write_page(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs.settings import load
     from minisplat_ref.app.viewer.page import write_page
     from minisplat_ref.io.formats import write_content
+    from minisplat_ref.io.upright import describe_up
     from minisplat_ref.rendering import SPLATTING
     from minisplat_ref.types import Gaussians
 
@@ -152,7 +161,7 @@ def _write_page(args: argparse.Namespace) -> int:
     options = ("max_bytes", "max_drop", "level", "scene", "downscale")
     if given := [name for name in options if getattr(args, name) is not None]:
         raise InputError(f"a page has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out")
-    source = open_source(path, args.extension, axes=args.axes)
+    source = open_source(path, args.extension, axes=args.axes, up=args.up)
     trained = source.trained
     population = trained.model.gaussians
     if further := [name for name in population._fields if name not in Gaussians._fields]:
@@ -161,10 +170,12 @@ def _write_page(args: argparse.Namespace) -> int:
         )
     name = scene_title(Path(load(path).scene)) if path.is_dir() and (path / CONFIG).is_file() else path.resolve().name
     cameras = [view for view in source.cameras if view.split != "test"] or source.cameras
-    write_content(out, write_page(name, population, cameras, trained.background))
+    write_content(out, write_page(name, population, cameras, trained.background, source.up.direction))
     print(
         f"{len(population.means):,} Gaussians of {name} in {out}, {out.stat().st_size:,} bytes: open it in any browser"
     )
+    if cameras:
+        print(describe_up(source.up))
     parts = [*trained.model.shared, *([] if trained.renderer.name == SPLATTING.name else [trained.renderer.name])]
     if parts:
         print(f"minisplat-ref: the page shows plain 3DGS, without {', '.join(parts)}", file=sys.stderr)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer, positive
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, add_up_argument, integer, positive
 
 DESCRIPTION = """\
 Write the surface of a run as a triangle mesh with colours: .ply, .obj or .glb
@@ -48,6 +48,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--parts", type=integer(1), default=50, metavar="N", help="keep the N largest connected parts (default 50)"
     )
+    add_up_argument(parser)
     parser.set_defaults(run=run, needs=("matplotlib",))
 
 
@@ -57,14 +58,19 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs.mesh_report import report_html
     from minisplat_ref.app.runs.meshing import MeshOptions, mesh_run, open_for_mesh
     from minisplat_ref.io.formats import write_content
+    from minisplat_ref.io.upright import describe_up, upright_rotation
     from minisplat_ref.mechanisms.meshes.files import check_suffix, write_mesh
 
     check_suffix(args.out)
     kind = DepthKind(args.depth)
     options = MeshOptions(args.folder, kind, args.voxel, args.unbounded, args.min_views, args.parts)
-    opened = open_for_mesh(args.folder)
+    opened = open_for_mesh(args.folder, args.up)
+    print(describe_up(opened.up))
     meshed = mesh_run(opened, options)
-    write_mesh(args.out, meshed.mesh)
+    mesh = meshed.mesh
+    if args.out.suffix.lower() == ".glb":  # in whose frame y is up; the others have the scene's
+        mesh = mesh._replace(vertices=mesh.vertices @ upright_rotation(opened.up.direction).T)
+    write_mesh(args.out, mesh)
     html = args.out.with_suffix(".html")
     write_content(html, report_html(opened, options, meshed, args.out).encode())
     size = " x ".join(map(str, meshed.shape))

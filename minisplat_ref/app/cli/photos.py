@@ -6,7 +6,7 @@ from pathlib import Path
 from minisplat_ref.app.cli.sfm import MATCHINGS
 from minisplat_ref.app.cli.steps import do, make_page_and_film, print_results, show_made
 from minisplat_ref.errors import InputError
-from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer, positive
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, add_up_argument, integer, positive
 
 SCENE, RUN = "scene", "run"
 
@@ -55,6 +55,7 @@ def add_parser(commands: Commands) -> None:
         metavar="M",
         help="exhaustive (default), or sequential (default of a video)",
     )
+    add_up_argument(parser)
     parser.set_defaults(run=run, needs=("matplotlib",), recommends=True)
 
 
@@ -69,9 +70,10 @@ def run(args: argparse.Namespace) -> int:
     scene, trained = folder / SCENE, folder / RUN
     if not args.photos.is_dir() and not is_video(args.photos):
         raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")
+    up = () if args.up is None else ("--up", args.up)
     if not scene.exists():
         matching = () if args.matching is None else ("--matching", args.matching)
-        do("sfm", args.photos, "--out", scene, *matching)
+        do("sfm", args.photos, "--out", scene, *matching, *up)
     if not run_folder.has_begun(trained):
         factor = _choose_factor(scene) if args.downscale is None else args.downscale
         limit = () if args.minutes is None else ("--minutes", f"{args.minutes:g}")
@@ -83,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     if code != 0:
         return code
     report = trained / run_folder.REPORT
-    if make_page_and_film(trained, folder):
+    if make_page_and_film(trained, folder, *up):
         photographs, metrics = settings.load_photographs(settings.load(trained)), trained / run_folder.METRICS
         shown = show_made(trained, report, folder)
         write_report(trained, photographs, run_folder.read_json_object(metrics), shown)

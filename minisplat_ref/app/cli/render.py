@@ -13,6 +13,7 @@ from minisplat_ref.interface.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
+    add_up_argument,
     add_worker_arguments,
     color,
     drop_workers,
@@ -27,10 +28,8 @@ if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
 
 DESCRIPTION = """\
-Render a run (its --out folder), or Gaussians that any program wrote: a PLY or a
-compact file (.spz and others, see minisplat-ref convert).
-
-Cameras, by --cameras:
+Render a run (its --out folder), a PLY or a compact file (.spz and others) that
+any program wrote. Cameras, by --cameras:
   test, train, all   those of the run (default test)
   orbit              along the training cameras, there and back unless they
                      stand all around; a circle around a PLY (its default)
@@ -95,6 +94,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
+    add_up_argument(parser)
     add_renderer_arguments(parser)
     parser.set_defaults(run=run)
 
@@ -121,6 +121,7 @@ def run(args: argparse.Namespace) -> int:
         args.extension,
         args.environment,
         args.axes,
+        args.up,
         background=args.background,
         profile=args.profile,
         backend=args.backend,
@@ -238,6 +239,7 @@ def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint
     from minisplat_ref.app.runs.model_source import place_viewpoints
     from minisplat_ref.io import orbits
     from minisplat_ref.io.camera_files import read_cameras
+    from minisplat_ref.io.upright import describe_up
 
     which: str = args.cameras or ("test" if any(view.split == "test" for view in source.cameras) else "orbit")
     if which == "orbit":
@@ -245,7 +247,9 @@ def _choose_views(args: argparse.Namespace, source: "Source") -> "list[Viewpoint
         width, height = args.size or ((like.width, like.height) if like else ORBIT_SIZE)
         followed = [view for view in source.cameras if view.split != "test"] or source.cameras
         means = source.trained.model.gaussians.means
-        return orbits.orbit(means, followed, args.frames, width, height, args.arc)
+        if source.cameras:
+            print(describe_up(source.up))
+        return orbits.orbit(means, followed, args.frames, width, height, args.arc, source.up.direction)
     if which not in RUN_CAMERAS:
         like = source.cameras[0].camera if source.cameras else None
         size = args.size or ((like.width, like.height) if like else ORBIT_SIZE)

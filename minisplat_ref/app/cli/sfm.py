@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.interface.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.interface.arguments import Commands, HelpFormatter, add_up_argument, integer
 
 if TYPE_CHECKING:
     from minisplat_ref.datasets.sfm import SfmResult
@@ -73,6 +73,7 @@ def add_parser(commands: Commands) -> None:
         metavar="NAME",
         help="lens to estimate: SIMPLE_RADIAL (default), RADIAL or OPENCV",
     )
+    add_up_argument(parser)
     parser.set_defaults(run=run, recommends=True)
 
 
@@ -89,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
         every=args.every,
         features=args.features,
         camera_model=args.camera_model,
+        up=args.up,
     )
     print("\n".join(_summarize(result, args.out, matching)))
     return 0
@@ -98,6 +100,7 @@ def _summarize(result: "SfmResult", out: Path, matching: str) -> list[str]:
     """Return the lines that are printed."""
     from minisplat_ref.datasets.sfm import advice
     from minisplat_ref.datasets.sfm.zoom import describe_found
+    from minisplat_ref.io.upright import describe_up
 
     n_placed = result.n_photos - len(result.left_out)
     placed = f"{n_placed} of {result.n_photos} photographs ({n_placed / result.n_photos:.0%})"
@@ -117,6 +120,7 @@ def _summarize(result: "SfmResult", out: Path, matching: str) -> list[str]:
         lines.append(f"the focal length is in no EXIF data; the photographs show that it is {found}")
     if result.n_masks:
         lines.append(f"masks: of {result.n_masks} photographs; no features were looked for where they are black")
+    lines.append(describe_up(result.up))
     return [*lines, _describe_exposures(out), *_propose_training(result, out)]
 
 

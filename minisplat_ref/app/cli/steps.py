@@ -15,16 +15,16 @@ def do(*words: str | Path) -> int:
     return args.run(args)
 
 
-def make_page_and_film(run: Path, folder: Path) -> bool:
+def make_page_and_film(run: Path, folder: Path, *up: str) -> bool:
     """Write the page and the film of a run into a folder, where they are not there; return whether one was written."""
     from minisplat_ref.app.runs.next_steps import FILM, FILM_OPTIONS, PAGE
 
     page, film = folder / PAGE, folder / FILM
     is_whole = page.exists() and film.exists()
     if not page.exists():
-        do("convert", run, page)
+        do("convert", run, page, *up)
     if not film.exists():
-        do("render", run, *FILM_OPTIONS, "--film", film, "--out", run / VIEWS)
+        do("render", run, *FILM_OPTIONS, "--film", film, "--out", run / VIEWS, *up)
     return not is_whole
 
 

@@ -8,6 +8,7 @@ from minisplat_ref.interface.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
+    add_up_argument,
     color,
     integer,
 )
@@ -54,6 +55,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
+    add_up_argument(parser)
     add_renderer_arguments(parser)
     parser.set_defaults(run=run)
 
@@ -66,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.app.runs.notices import warn_of_model
     from minisplat_ref.app.viewer.browser import Content, Viewer, address, open_server, serve
     from minisplat_ref.app.viewer.photographs import load_thumbnails
+    from minisplat_ref.io.upright import describe_up
 
     path: Path = args.input
     source = open_source(
@@ -73,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
         args.extension,
         args.environment,
         args.axes,
+        args.up,
         background=args.background,
         profile=args.profile,
         backend=args.backend,
@@ -83,7 +87,9 @@ def run(args: argparse.Namespace) -> int:
     check_film(film, ())
     photographs = (lambda: load_thumbnails(path)) if source.cameras else None
     server = open_server(args.port, path.resolve().name)
-    viewer = Viewer(server, Content(source.trained, source.cameras, photographs, film))
+    viewer = Viewer(server, Content(source.trained, source.cameras, photographs, film, source.up.direction))
+    if source.cameras:
+        print(describe_up(source.up))
     print(f"open {address(server)} in a browser; Ctrl-C ends", flush=True)
     try:
         serve(viewer)

@@ -15,10 +15,13 @@ import numpy as np
 from minisplat_ref.app.runs.model_file import find_file, make_label, read_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, owner_of
+from minisplat_ref.io import viewpoints
 from minisplat_ref.io.formats import Format, with_label
 from minisplat_ref.io.frames import frame_of_means, place_scene
 from minisplat_ref.io.label import NO_LABEL, Label
 from minisplat_ref.io.ply import are_far
+from minisplat_ref.io.upright import Up, find_up, given_up, upright_rotation
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
@@ -127,6 +130,32 @@ def choose_format(path: Path) -> Format | None:
     if format_ is not None and not format_.levels:
         raise InputError(f"{path}: a {format_.suffix} is read, but not written: choose another format")
     return format_
+
+
+def find_up_of(path: Path, gaussians: Gaussians, given: str | None) -> Up | None:
+    """Return what is up in a run, or as it is given; None for a file of which nobody says it.
+
+    Raises
+    ------
+    InputError
+        ``given`` makes no sense.
+    """
+    from minisplat_ref.app.runs.run_folder import CAMERAS, CONFIG
+    from minisplat_ref.app.runs.settings import load_up
+
+    views = viewpoints.read(path / CAMERAS) if (path / CAMERAS).is_file() else []
+    names, cameras = [view.name for view in views], [view.camera for view in views]
+    if given is not None:
+        return given_up(given, names, cameras)
+    recorded = load_up(path) if (path / CONFIG).is_file() else None
+    return recorded or (find_up(cameras, gaussians.means) if cameras else None)
+
+
+def make_upright(gaussians: Gaussians, up: Up) -> Gaussians:
+    """Return Gaussians turned about the origin, so that -y is up."""
+    turn = upright_rotation(up.direction)  # [3, 3]
+    one = Deformation(turn[None], np.zeros(len(gaussians.means), np.int64))
+    return deform(gaussians, gaussians.means.astype(np.float64) @ turn.T, one)
 
 
 def check_population(population: Any, format_: Format, what: str) -> None:

@@ -8,6 +8,7 @@ from minisplat_ref.app.reports.images import Image8, to_8_bits
 from minisplat_ref.app.reports.page import add_caption, page, panel, section, table
 from minisplat_ref.app.runs.meshing import Meshed, MeshOptions, Opened
 from minisplat_ref.io.frames import place_points
+from minisplat_ref.io.upright import turn_upright
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
 from minisplat_ref.mechanisms.peeling.kernels import peel
 from minisplat_ref.mechanisms.peeling.layers import Frame, TranslucentMesh
@@ -42,6 +43,7 @@ def report_html(opened: Opened, options: MeshOptions, meshed: Meshed, name: Path
     sides = opened.views[:: -(-len(opened.views) // N_SIDES)]
     panels = []
     for view in sides:
+        view = view._replace(camera=turn_upright(view.camera, opened.up.direction))
         camera = opened.adapt_camera(view)
         splats = to_8_bits(opened.trained.render(view_from(view.camera, time=view.time)).image[..., :3])
         images = {

@@ -12,13 +12,14 @@ import numpy as np
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.depth_maps import DepthKind, depth_map
 from minisplat_ref.app.runs.scoring import Trained, load_trained
-from minisplat_ref.app.runs.settings import load_frame
+from minisplat_ref.app.runs.settings import load_frame, load_up
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.frames import place_camera
 from minisplat_ref.io.orbits import nearest_to_axes
+from minisplat_ref.io.upright import UNKNOWN, Up, find_up, given_up
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest, marching_cubes_package
 from minisplat_ref.mechanisms.fusion.kernels import fuse
@@ -65,6 +66,8 @@ class Opened(NamedTuple):
     trained: Trained
     views: list[Viewpoint]
     frame: Frame
+    up: Up = UNKNOWN
+    """What is up."""
 
     def render_map(self, view: Viewpoint, kind: DepthKind) -> DepthMap:
         """Return the image and the depth map of a camera."""
@@ -75,18 +78,28 @@ class Opened(NamedTuple):
         return with_principal_point(view.camera, PROFILES[self.trained.profile])
 
 
-def open_for_mesh(folder: Path) -> Opened:
+def open_for_mesh(folder: Path, up: str | None = None) -> Opened:
     """Read a run and its training cameras.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    up : str, optional
+        As for :func:`.model_source.open_source`.
 
     Raises
     ------
     InputError
-        The folder holds no run, or its cameras cannot be read.
+        The folder holds no run, its cameras cannot be read, or ``up`` makes no sense.
     """
     trained, frame = load_trained(folder), load_frame(folder)
     every = viewpoints.read(folder / run_folder.CAMERAS)
-    views = [view for view in every if view.split != "test"] or every
-    return Opened(trained, [view._replace(camera=place_camera(view.camera, frame)) for view in views], frame)
+    every = [view._replace(camera=place_camera(view.camera, frame)) for view in every]
+    names, cameras = [view.name for view in every], [view.camera for view in every]
+    found = load_up(folder) if up is None else given_up(up, names, cameras)
+    found = found or find_up(cameras, trained.model.gaussians.means)
+    return Opened(trained, [view for view in every if view.split != "test"] or every, frame, found)
 
 
 def mesh_run(opened: Opened, options: MeshOptions) -> Meshed:

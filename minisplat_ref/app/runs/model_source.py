@@ -9,11 +9,12 @@ import numpy as np
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.model_file import find_file, read_model
 from minisplat_ref.app.runs.scoring import Trained, load_trained
-from minisplat_ref.app.runs.settings import load_frame, place_model
+from minisplat_ref.app.runs.settings import load_frame, load_up, place_model
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.frames import frame_of_means, place_camera
+from minisplat_ref.io.upright import UNKNOWN, Up, find_up, given_up
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.mechanisms.gbuffer.lighting import relight
 from minisplat_ref.types import Frame, Model
@@ -29,6 +30,8 @@ class Source(NamedTuple):
     path: Path
     """The opened source."""
     frame: Frame
+    up: Up = UNKNOWN
+    """What is up."""
 
     def beside(self, name: str) -> Path:
         """Return the default folder of the output: inside of a run, beside a file."""
@@ -36,7 +39,12 @@ class Source(NamedTuple):
 
 
 def open_source(
-    path: Path, extension: str | None = None, environment: Path | None = None, axes: str | None = None, **given: Any
+    path: Path,
+    extension: str | None = None,
+    environment: Path | None = None,
+    axes: str | None = None,
+    up: str | None = None,
+    **given: Any,
 ) -> Source:
     """Open a run, a PLY or a compact file.
 
@@ -50,6 +58,8 @@ def open_source(
         Other light for a model that is lit.
     axes : str, optional
         Those of an .spz, instead of those that it names.
+    up : str, optional
+        What is up (:func:`minisplat_ref.io.upright.given_up`), instead of what is recorded or found.
     **given
         ``background``, ``profile`` and ``backend`` instead of the run's; None counts as not given.
 
@@ -64,10 +74,22 @@ def open_source(
     if axes is not None and path.is_dir():
         raise InputError(f"{path}: --axes is for .spz, whose programs disagree about them: leave it out")
     source = _open_run(path, extension) if path.is_dir() else _open_file(path, extension, axes, folder)
+    source = source._replace(up=_choose_up(source, up))
     given = {name: value for name, value in given.items() if value is not None}
     if environment is not None:
         given["model"] = relight(source.trained.model, environment)
     return source._replace(trained=source.trained._replace(**given))
+
+
+def _choose_up(source: Source, given: str | None) -> Up:
+    """Return what is up: as given, as the run has recorded, or as cameras and Gaussians show."""
+    names, cameras = [view.name for view in source.cameras], [view.camera for view in source.cameras]
+    if given is not None:
+        return given_up(given, names, cameras)
+    recorded = load_up(source.path) if source.path.is_dir() else None
+    if recorded is not None:
+        return recorded
+    return find_up(cameras, source.trained.model.gaussians.means) if cameras else source.up
 
 
 def _open_run(folder: Path, extension: str | None) -> Source:

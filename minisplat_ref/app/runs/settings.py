@@ -33,6 +33,7 @@ from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.io.scene import Listing, build_reading, build_scene
+from minisplat_ref.io.upright import Up, find_up, read_up, up_from_json, up_to_json
 from minisplat_ref.mechanisms.cameras.models import check_optics
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics.lpips import Network, check_views, load_network
@@ -148,10 +149,35 @@ def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any
         "settings": asdict(settings),
         "background": scene.background.tolist(),
         **({} if scene.frame == FILE_FRAME else {"frame": frame_to_json(scene.frame)}),
+        "up": up_to_json(scene_up(settings, scene)),
         "recipe": describe(recipe),
         "versions": {"minisplat_ref": __version__, "python": platform.python_version(), **versions},
         "platform": platform.platform(),
     }
+
+
+def scene_up(settings: Settings, scene: Scene) -> Up:
+    """Return what is up in the scene of a run: what its folder records, or what cameras and points show.
+
+    Raises
+    ------
+    InputError
+        The file of the scene is damaged.
+    """
+    cameras = [view.camera for view in (*scene.train_views, *scene.test_views)]
+    return read_up(Path(settings.scene)) or find_up(cameras, scene.points)
+
+
+def load_up(folder: Path) -> Up | None:
+    """Read what is up in the scene of a run; None in runs that do not record it.
+
+    Raises
+    ------
+    InputError
+        As for :func:`load`.
+    """
+    recorded = _read_config(folder).get("up")
+    return None if recorded is None else up_from_json(recorded, folder / CONFIG)
 
 
 def load(folder: Path) -> Settings:

@@ -22,7 +22,9 @@ from minisplat_ref.app.viewer.photographs import camera_scale
 from minisplat_ref.app.viewer.poses import Pose, camera_from_pose, choose_start, pose_from_camera
 from minisplat_ref.app.viewer.progression import Shown, Wanted, fit, next_divisor, reduced
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.upright import turn_upright
 from minisplat_ref.io.viewpoints import Viewpoint
+from minisplat_ref.types import Floats
 
 HOST = "127.0.0.1"
 POLL_SECONDS = 0.02  # between polls of the browsers' requests
@@ -42,6 +44,8 @@ class Content(NamedTuple):
     """Loads the photographs by the cameras' names, when they are first needed."""
     film: Path | None
     """The file that a film is written to; None: there are none."""
+    up: Floats
+    """[3] what is up, in the frame of the model."""
 
 
 class _Window:
@@ -108,7 +112,7 @@ class Viewer:
         self._pixel_seconds: float | None = None
         self._keyframes: list[Pose] = []
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # from viser's threads
-        start = choose_start(content.trained.model.gaussians.means, content.cameras)
+        start = choose_start(content.trained.model.gaussians.means, content.cameras, content.up)
         server.scene.set_up_direction(tuple(start.up.tolist()))
         initial = server.initial_camera
         initial.position, initial.look_at, initial.up = start.pose.position, tuple(start.target), tuple(start.up)
@@ -200,6 +204,7 @@ class Viewer:
 
     def _frustum(self, k: int, view: Viewpoint, scale: float, images: dict[str, Image8]) -> Any:
         pose, camera = pose_from_camera(view.camera, view.time), view.camera
+        upright = pose_from_camera(turn_upright(camera, self._content.up), view.time)
         aspect = camera.fy * camera.width / (camera.fx * camera.height)
         frustum = self._server.scene.add_camera_frustum(
             f"/cameras/{k}",
@@ -215,8 +220,8 @@ class Viewer:
 
         def go_there(event: Any) -> None:
             with event.client.atomic():
-                event.client.camera.wxyz, event.client.camera.position = pose.wxyz, pose.position
-                event.client.camera.fov = pose.fov
+                event.client.camera.wxyz, event.client.camera.position = upright.wxyz, upright.position
+                event.client.camera.fov = upright.fov
 
         frustum.on_click(go_there)
         return frustum

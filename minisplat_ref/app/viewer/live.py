@@ -9,6 +9,7 @@ from typing import Any
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.app.runs.scoring import Trained, choose_renderer
+from minisplat_ref.app.runs.settings import scene_up
 from minisplat_ref.app.viewer.browser import Content, Viewer
 from minisplat_ref.app.viewer.photographs import thumbnails
 from minisplat_ref.io.viewpoints import scene_viewpoints
@@ -37,7 +38,8 @@ def make_live_view(server: Any) -> Callable[[Path, Scene, Settings, Progress], C
                     renderer = choose_renderer(settings, model)
                     trained = Trained(model, renderer, scene.background, settings.profile, settings.backend)
                     if viewer is None:
-                        content = Content(trained, scene_viewpoints(scene), lambda: thumbnails(scene), None)
+                        up = scene_up(settings, scene).direction
+                        content = Content(trained, scene_viewpoints(scene), lambda: thumbnails(scene), None, up)
                         viewer = Viewer(server, content)
                     viewer.show(trained)
                     n_gaussians = len(model.gaussians.means)

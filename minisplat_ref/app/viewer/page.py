@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.app.viewer.poses import choose_start
+from minisplat_ref.app.viewer.poses import choose_start, make_upright
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.orbits import orbit
 from minisplat_ref.io.packing.deflating import gzip_compressor
@@ -44,7 +44,9 @@ BLOCK = 3 << 20  # bytes that become text at once; multiples of three have no pa
 FLOAT16_MAX = 65504.0
 
 
-def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], background: Floats) -> Iterator[bytes]:
+def write_page(
+    title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], background: Floats, up: Floats
+) -> Iterator[bytes]:
     """Return the parts of a self-contained page that shows Gaussians, in UTF-8.
 
     Parameters
@@ -57,6 +59,8 @@ def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], b
         Cameras that the viewer offers, in the frame of the Gaussians; the first is shown first. Without any, a circle.
     background : ndarray of shape (3,)
         RGB in [0, 1].
+    up : ndarray of shape (3,)
+        What is up, world frame. Cameras that were held on their side are turned upright.
 
     Raises
     ------
@@ -67,8 +71,8 @@ def write_page(title: str, gaussians: Gaussians, cameras: Sequence[Viewpoint], b
     largest = float(np.abs(gaussians.sh_dc).max(initial=0.0))
     if largest > FLOAT16_MAX:
         raise InputError(f"{title}: a coefficient of {largest:g}, beyond {FLOAT16_MAX:g}, is no colour: remove its row")
-    views = list(cameras) or orbit(gaussians.means, [], N_VIEWS_WITHOUT_CAMERAS, *CIRCLE_SIZE)
-    start = choose_start(gaussians.means, list(cameras))
+    views = make_upright(cameras, up) or orbit(gaussians.means, [], N_VIEWS_WITHOUT_CAMERAS, *CIRCLE_SIZE, up=up)
+    start = choose_start(gaussians.means, list(cameras), up)
     header, content = pack(gaussians)
     scene = header | {
         "background": np.asarray(background, np.float64).tolist(),

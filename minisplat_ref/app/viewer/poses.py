@@ -13,7 +13,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.orbits import common_up, nearest_to_axes, orbit
+from minisplat_ref.io.orbits import nearest_to_axes, orbit
+from minisplat_ref.io.upright import turn_upright
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.types import Camera, Floats
 
@@ -59,7 +60,7 @@ def pose_from_camera(camera: Camera, time: float = 0.0) -> Pose:
     return Pose((w, x, y, z), tuple(np.asarray(camera.center, np.float64).tolist()), fov, time)
 
 
-def choose_start(means: Floats, cameras: Sequence[Viewpoint]) -> Start:
+def choose_start(means: Floats, cameras: Sequence[Viewpoint], up: Floats) -> Start:
     """Return the start of a viewer: the first camera, or without any the start of the circle of ``render``.
 
     Parameters
@@ -68,16 +69,22 @@ def choose_start(means: Floats, cameras: Sequence[Viewpoint]) -> Start:
         Centres of the Gaussians, world frame.
     cameras : sequence of Viewpoint
         Of the training.
+    up : ndarray of shape (3,)
+        What is up, world frame.
     """
-    views = list(cameras) or orbit(means, [], 1, 640, 480)
+    views = make_upright(cameras, up) or orbit(means, [], 1, 640, 480, up=up)
     rotations = np.array([view.camera.cam_from_world_R for view in views])  # [V, 3, 3]
     centres = np.array([view.camera.center for view in views])  # [V, 3]
     middle = nearest_to_axes(centres, rotations[:, 2]) if cameras else np.median(means, axis=0) if len(means) else None
-    up = common_up(rotations) if cameras else np.array([0.0, -1.0, 0.0])
     position, forward = centres[0], rotations[0, 2]  # [3], [3]
     to_middle = forward if middle is None else middle - position
     distance = max(float(to_middle @ forward), NEAREST_TARGET * float(np.linalg.norm(to_middle)))
     return Start(pose_from_camera(views[0].camera, views[0].time), position + distance * forward, up)
+
+
+def make_upright(views: Sequence[Viewpoint], up: Floats) -> list[Viewpoint]:
+    """Return views of which each is turned by the quarters of a circle that make its image most nearly upright."""
+    return [view._replace(camera=turn_upright(view.camera, up)) for view in views]
 
 
 def travel(keyframes: Sequence[Pose], n_frames: int) -> list[Pose]:

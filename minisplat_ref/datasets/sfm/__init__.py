@@ -23,6 +23,7 @@ from minisplat_ref.datasets.sfm.features import (
     pairs_to_match,
 )
 from minisplat_ref.datasets.sfm.judging import Matches, choose, read_matches
+from minisplat_ref.datasets.sfm.level import record_up
 from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
 from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
 from minisplat_ref.datasets.sfm.zoom import copy_database, own_groups, split_groups
@@ -31,6 +32,7 @@ from minisplat_ref.datasets.video import is_video, keep_sharpest
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos
+from minisplat_ref.io.upright import Up
 
 PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
 ROUNDS = 2  # in which photographs are told apart by their focal lengths, the second one with right cameras
@@ -61,6 +63,8 @@ class SfmResult(NamedTuple):
     """Photographs with a mask."""
     sizes: tuple[tuple[int, int], ...]
     """Width and height of each photograph in the scene, pixels."""
+    up: Up
+    """What is up."""
 
 
 def default_matching(photos: Path) -> str:
@@ -77,6 +81,7 @@ def run_sfm(
     every: int | None = None,
     features: str = "auto",
     camera_model: str = "SIMPLE_RADIAL",
+    up: str | None = None,
 ) -> SfmResult:
     """Make a COLMAP scene with pinhole cameras from photographs, complete or not at all.
 
@@ -97,6 +102,8 @@ def run_sfm(
         standard, then dense if that leaves photographs without a place or gives few points; the better result is kept.
     camera_model : str
         COLMAP model that is estimated, for each group of photographs with one size, camera and focal length.
+    up : str, optional
+        What is up (:func:`minisplat_ref.io.upright.given_up`), instead of what photographs and points show.
 
     Returns
     -------
@@ -128,6 +135,7 @@ def run_sfm(
         (work / "sparse" / "0").mkdir(parents=True)
         best.model.write(work / "sparse" / "0")
         written = undistort_colmap(work, colmap_photos(work, best.model), folder)
+        upright = record_up(folder, photographs, up)
     placed = {image.name for image in best.model.images.values() if image.has_pose}
     return SfmResult(
         n_photos=n_photos,
@@ -140,6 +148,7 @@ def run_sfm(
         groups=groups,
         n_masks=len(photographs.masked),
         sizes=tuple((photo.camera.width, photo.camera.height) for photo in written),
+        up=upright,
     )
 
 

@@ -352,10 +352,11 @@ def test_demo_does_not_touch_another(demo_folder, monkeypatch, capsys):
 
 def test_demo_writes_a_self_contained_report(demo_folder):
     folder = demo_folder
-    assert {path.name for path in folder.iterdir()} == RUN_FILES | {"scene", "scene.html"}
+    assert {path.name for path in folder.iterdir()} == RUN_FILES | {"scene", "scene.html", "film.gif", "views"}
     page = (folder / "report.html").read_text()
     links = re.findall(r'(?:src|href)="([^"]*)"', page)
-    (scene,) = [link for link in links if not link.startswith(("data:image/png;base64,", "#"))]
+    inside = ("data:image/png;base64,", "data:image/webp;base64,", "#")
+    (scene,) = [link for link in links if not link.startswith(inside)]
     assert scene == "scene.html", "beside the report, which needs nothing else"
     assert not re.search(r"url\((?!#)|@import|<script src|<link", page)
     assert page.count("data:image/png") == 3 * 2 * N_TEST and page.count("<svg") == 3
@@ -363,11 +364,12 @@ def test_demo_writes_a_self_contained_report(demo_folder):
 
 
 def test_the_commands_of_a_demo_run_from_anywhere(demo_folder, tmp_path):
-    """The first of them, in a shell, in another folder."""
+    """The first of them, in a shell that finds the program, in another folder."""
     page = html.unescape((demo_folder / "report.html").read_text())
     line = re.search(r"<pre[^>]*>(.*render .*)</pre>", page)[1]
     assert shlex.quote(str(demo_folder)) in line
-    subprocess.run(f"{line} --frames 1", shell=True, cwd=tmp_path, check=True)
+    environment = {**os.environ, "PATH": f"{os.path.dirname(sys.executable)}{os.pathsep}{os.environ['PATH']}"}
+    subprocess.run(f"{line} --frames 1", shell=True, cwd=tmp_path, check=True, env=environment)
     assert not any(tmp_path.iterdir()) and any(demo_folder.rglob("*orbit*"))
 
 

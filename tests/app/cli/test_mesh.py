@@ -75,6 +75,16 @@ def test_the_surface_is_where_the_depths_are(kind, run):
     assert meshed.voxel == pytest.approx(0.1)
 
 
+def test_a_glb_is_upright(run, tmp_path, capsys):
+    """In glTF y is up: a mesh whose x is up is turned; a PLY has the axes of the scene."""
+    trimesh = pytest.importorskip("trimesh")
+    assert mesh(run, tmp_path / "a.ply", "--voxel", "0.2", "--up", "1,0,0") == 0
+    assert mesh(run, tmp_path / "a.glb", "--voxel", "0.2", "--up", "1,0,0") == 0
+    assert "up is 1.00,0.00,0.00, by --up 1,0,0" in capsys.readouterr().out
+    heights = trimesh.load(tmp_path / "a.glb", force="mesh").vertices[:, 1]
+    assert_allclose(np.sort(heights), np.sort(load_mesh(tmp_path / "a.ply").vertices[:, 0]), atol=1e-5)
+
+
 def test_without_bounds_it_reaches_further(run, tmp_path, capsys):
     assert mesh(run, tmp_path / "far.ply", "--unbounded", "--voxel", "0.05") == 0
     assert mesh(run, tmp_path / "near.ply", "--voxel", "0.05") == 0

@@ -24,6 +24,7 @@ from minisplat_ref.types import Camera, Gaussians
 SECONDS = 60.0  # until the picture must be there; it takes two on an idle machine
 SIZE = (96, 72)
 BACKGROUND = np.array([0.1, 0.2, 0.3])
+UP = np.array([0.0, -1.0, 0.0])
 PSNR_MIN = 52.0  # dB: pixels of 8 bits alone cost 59 dB; harmonics in 8 bits and blending in half floats the rest
 PSNR_OF_ANOTHER = 25.0  # dB that a wrong order of the quaternion's components must not reach
 
@@ -40,7 +41,7 @@ def one():
 
 
 def page_of(title, gaussians, views):
-    return b"".join(write_page(title, gaussians, views, BACKGROUND)).decode()
+    return b"".join(write_page(title, gaussians, views, BACKGROUND, UP)).decode()
 
 
 def test_arrays_by_hand():
@@ -77,6 +78,15 @@ def test_a_page_holds_its_cameras_and_loads_nothing():
     view = scene["views"][0]
     assert view["name"] == "</script>" and view["position"] == [0.0, 0.0, -1.0] and view["cx"] == 50.0
     assert scene["background"] == BACKGROUND.tolist() and scene["target"][:2] == [0.0, 0.0]
+
+
+def test_a_camera_on_its_side_is_turned_upright():
+    """What was up is at the right of its image; the page gets an image that is higher than wide, and what is up."""
+    up = np.array([1.0, 0.0, 0.0])
+    scene, _ = parts(b"".join(write_page("a", one(), [Viewpoint("a", camera(), "train")], BACKGROUND, up)).decode())
+    (view,) = scene["views"]
+    assert (view["width"], view["height"]) == SIZE[::-1] and scene["up"] == up.tolist()
+    assert view["R"] == [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
 
 
 @pytest.mark.parametrize("n", [0, 3])

@@ -36,6 +36,9 @@ def trained():
 # poses
 
 
+UP = np.array([0.0, -1.0, 0.0])
+
+
 def test_a_pose_and_its_camera():
     """cos 45 + j sin 45 turns the camera's z to the world's x: seen along x, from x = -2."""
     half = math.sqrt(0.5)
@@ -72,15 +75,15 @@ def test_where_it_starts():
     half = math.sqrt(0.5)
     poses = [Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -4.0), 1.0), Pose((half, 0.0, half, 0.0), (-4.0, 0.0, 0.0), 1.0)]
     cameras = [Viewpoint(f"{k}", camera_from_pose(pose, 8, 6), "train", 0.5) for k, pose in enumerate(poses)]
-    start = choose_start(np.zeros((0, 3)), cameras)
+    start = choose_start(np.zeros((0, 3)), cameras, UP)
     np.testing.assert_allclose(np.hstack(start.pose), np.hstack(poses[0]._replace(time=0.5)), atol=1e-9)
     np.testing.assert_allclose(start.target, [0, 0, 0], atol=0.02)  # the damping of nearest_to_axes
     np.testing.assert_allclose(start.up, [0, -1, 0], atol=1e-9)
     means = np.array([[5.0, 1.0, 2.0]]) + np.random.default_rng(0).normal(size=(40, 3))
-    start, middle = choose_start(means, []), np.median(means, axis=0)
+    start, middle = choose_start(means, [], UP), np.median(means, axis=0)
     np.testing.assert_allclose(start.target, middle, atol=1e-9)
     np.testing.assert_allclose(start.up, [0, -1, 0])
-    assert np.isfinite(np.hstack(choose_start(means[:0], []).pose)).all()
+    assert np.isfinite(np.hstack(choose_start(means[:0], [], UP).pose)).all()
 
 
 def test_how_large_cameras_are_shown():

@@ -52,7 +52,9 @@ def trained(x=0.0, color=(0.9, 0.3, 0.1)):
 
 def content(**changes):
     cameras = [Viewpoint("0001", camera_from_pose(AHEAD, *SIZE), "train", 0.0)]
-    whole = Content(trained(), cameras, lambda: {"0001": np.full((12, 16, 3), 200, np.uint8)}, None)
+    whole = Content(
+        trained(), cameras, lambda: {"0001": np.full((12, 16, 3), 200, np.uint8)}, None, np.array([0.0, -1.0, 0.0])
+    )
     return whole._replace(**changes)
 
 
@@ -172,7 +174,10 @@ def test_the_clock_of_a_training_stands_still_while_a_frame_is_drawn(monkeypatch
     monkeypatch.setattr(live, "Viewer", Watched)
     monkeypatch.setattr(live, "choose_renderer", lambda settings, model: SPLATTING)
     scene = make_scene("room", n_views=3, width=16, height=12, supersampling=1, n_points=20).scene
-    settings, progress = SimpleNamespace(profile="GSPLAT_MAIN", backend="cpu"), SimpleNamespace(paused=paused)
+    settings, progress = (
+        SimpleNamespace(profile="GSPLAT_MAIN", backend="cpu", scene="room"),
+        SimpleNamespace(paused=paused),
+    )
     on_step = live.make_live_view(None)(None, scene, settings, progress)
     report = SimpleNamespace(state=SimpleNamespace(model=trained().model), step=1, last_step=2)
     on_step(report)

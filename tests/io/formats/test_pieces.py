@@ -21,6 +21,7 @@ from minisplat_ref.io.packing import container, deflating, pieces
 N, ROWS = 1500, 256  # the last piece is not whole
 WRITTEN = [format_ for _, format_ in all_formats() if format_.levels]
 BLACK = np.zeros(3)
+UP = np.array([0.0, -1.0, 0.0])
 
 
 def content_of(format_, gaussians):
@@ -42,10 +43,10 @@ def test_pieces_make_the_same_file(format_, dtype, monkeypatch):
 
 def test_pieces_make_the_same_page(monkeypatch):
     gaussians = population(N, 3)
-    whole = b"".join(write_page("a", gaussians, [], BLACK))
+    whole = b"".join(write_page("a", gaussians, [], BLACK, UP))
     monkeypatch.setattr(pieces, "ROWS", ROWS)
     monkeypatch.setattr("minisplat_ref.app.viewer.page.BLOCK", 3 * 100)
-    assert b"".join(write_page("a", gaussians, [], BLACK)) == whole
+    assert b"".join(write_page("a", gaussians, [], BLACK, UP)) == whole
 
 
 def test_axes_of_spz_in_pieces(monkeypatch):
