@@ -12,6 +12,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders, module_of
+from minisplat_ref.interface.arguments import suggest
 from minisplat_ref.io.formats import UNBUNDLED, Format
 from minisplat_ref.io.formats.catalogue import FORMATS
 from minisplat_ref.io.formats.sog import SOG
@@ -74,7 +75,7 @@ def load_extension(name: str) -> Extension:
     """
     found = folders()
     if name not in found:
-        raise InputError(f"extension {name!r} does not exist: choose from {', '.join(found) or 'none'}")
+        raise InputError(f"extension {name!r} does not exist{suggest(name, found)}")
     return _load(name, found[name])
 
 
@@ -199,7 +200,7 @@ def _of_extensions(name: str) -> tuple[Recipe, Extension]:
     found = [(recipe, extension) for extension in extensions for recipe in extension.recipes if recipe.name == name]
     if not found:
         names = (*RECIPES, *(recipe.name for extension in extensions for recipe in extension.recipes))
-        raise InputError(f"recipe {name!r} does not exist: choose from {', '.join(names)}")
+        raise InputError(f"recipe {name!r} does not exist{suggest(name, names)}")
     if len(found) > 1:
         owners = " and ".join(extension.name for _, extension in found)
         raise InputError(f"recipe {name} is in the extensions {owners}: rename one")

@@ -62,6 +62,12 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     return f"; did you mean {bare[near[0]]}?" if near else ""
 
 
+def suggest(word: str, choices: Iterable[str]) -> str:
+    """Return the choice that a word was probably meant to be, as the end of a sentence; where none is near, all."""
+    names = list(choices)
+    return did_you_mean(word, names) or f": choose from {', '.join(names) or 'none'}"
+
+
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """Keeps the line breaks of descriptions, which are 80 columns wide at most, and uses up to 100 for options."""
 

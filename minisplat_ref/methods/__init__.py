@@ -4,6 +4,7 @@ A recipe is data (:mod:`minisplat_ref.training.schedule`), written for its publi
 """
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import suggest
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, MINI_SPLATTING_D
@@ -28,5 +29,5 @@ def get_recipe(name: str, iterations: int | None = None) -> Recipe:
         There is no such recipe, or ``iterations`` is below 1.
     """
     if name not in RECIPES:
-        raise InputError(f"recipe {name!r} does not exist: choose from {', '.join(RECIPES)}")
+        raise InputError(f"recipe {name!r} does not exist{suggest(name, RECIPES)}")
     return RECIPES[name] if iterations is None else scale_recipe(RECIPES[name], iterations)

@@ -62,9 +62,34 @@ class RenderGradient(NamedTuple):
     shared: Mapping[str, Floats] = NOTHING  # with respect to the model's shared parameters, by name
 
 
+MISSING: Any = None  # a camera that was not given, so that the message can say where there are some
+
+
+def _check_arguments(gaussians: Any, camera: Any) -> None:
+    """Refuse what is often passed instead of Gaussians and a camera, and say where these come from.
+
+    Raises
+    ------
+    InputError
+        The first has not the fields of Gaussians, or the second not those of a camera.
+    """
+    if not hasattr(gaussians, "sh_rest"):
+        ways = "ms.load_ply(path) reads them from a file"
+        raise InputError(f"render takes Gaussians and a camera, and the first is {_a(gaussians)}: {ways}")
+    if not hasattr(camera, "optics"):
+        inside = "view.camera" if hasattr(camera, "camera") else "scene.train_views[0].camera, of ms.load_scene(path)"
+        what = "there is no camera" if camera is MISSING else f"the second is {_a(camera)}"
+        raise InputError(f"render takes Gaussians and a camera, and {what}: pass {inside}")
+
+
+def _a(value: Any) -> str:
+    name = type(value).__name__
+    return f"a{'n' * (name[0] in 'aeiouAEIOU')} {name}"
+
+
 def render(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera = MISSING,
     *,
     background: Floats | None = None,
     sh_degree: int | Ints | None = None,
@@ -104,7 +129,13 @@ def render(
         Image [H, W, 3] (4 with depth) and alpha [H, W] in the dtype of the Gaussians.
     tape : RenderTape
         For :func:`render_vjp`.
+
+    Raises
+    ------
+    InputError
+        The first two arguments are something else, which the message names, or ``sh_degree`` is not stored.
     """
+    _check_arguments(gaussians, camera)
     if camera.optics is not None:
         raise InputError(f"this renderer draws pinholes, not {camera.optics.model} cameras: train with --recipe lens")
     dtype = gaussians.means.dtype

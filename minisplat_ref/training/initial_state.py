@@ -39,7 +39,8 @@ def initial_state(
     Raises
     ------
     InputError
-        The scene has no training views, or fewer than the recipe needs.
+        The scene has no training views, or fewer than the recipe needs, or a term of its loss has no weight that makes
+        sense.
     """
     n_views = len(scene.train_views)
     if n_views == 0:
@@ -49,6 +50,11 @@ def initial_state(
             f"scene {scene.name} has {n_views} training views, recipe {recipe.name} needs at least"
             f" {recipe.min_views}: add photographs or use 3dgs-accel"
         )
+    for term in recipe.losses:
+        if not 0 <= term.weight < math.inf:
+            raise InputError(
+                f"recipe {recipe.name} weighs its loss term {term.name} by {term.weight:g}: a weight is at least 0"
+            )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
     if populate is None:

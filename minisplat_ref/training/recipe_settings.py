@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import suggest
 from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.calibration import EXPOSURE, EXPOSURE_SOURCES, HELD_EXPOSURE, LEARNED, REFINED, TRACKS
 from minisplat_ref.training.exposure_gauge import hold_mean_exposure
@@ -79,7 +80,7 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
     known = settings_of(recipe)
     for name, value in settings.items():
         if name not in known:
-            raise InputError(f"recipe {recipe.name} has no {name} to set: choose from {', '.join(sorted(known))}")
+            raise InputError(f"recipe {recipe.name} has no {name} to set{suggest(name, sorted(known))}")
         is_source = name == EXPOSURE.name
         if is_source and value not in EXPOSURE_SOURCES:
             raise InputError(f"exposure={value}: choose from {', '.join(EXPOSURE_SOURCES)}")
@@ -159,9 +160,8 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     known = settings_of(recipe)
     unknown = [name for name in texts if name not in known]
     if unknown:
-        raise InputError(
-            f"recipe {recipe.name} has no {', '.join(unknown)} to set: choose from {', '.join(sorted(known))}"
-        )
+        meant = suggest(unknown[-1], sorted(known))
+        raise InputError(f"recipe {recipe.name} has no {', '.join(unknown)} to set{meant}")
     weights = {term.name for term in recipe.losses}
     if texts.get(EXPOSURE.name, TRACKS) not in EXPOSURE_SOURCES:
         raise InputError(f"--set exposure={texts[EXPOSURE.name]}: choose from {', '.join(EXPOSURE_SOURCES)}")

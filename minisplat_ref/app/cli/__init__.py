@@ -58,6 +58,7 @@ measure it, and check every formula against a reference that can be read.
 First time here:   minisplat-ref demo
 Your own photos:   minisplat-ref photos PHOTOS --out mine
 """
+SMALLER = ("downscale", "size", "width", "height", "views", "supersampling", "frames")  # options of less memory
 EPILOG = "Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."
 
 
@@ -176,10 +177,19 @@ def _run(argv: Sequence[str]) -> int:
         parser.print_help()
         return 0
     check_packages(getattr(args, "needs", ()))
-    code: int = args.run(args)
+    try:
+        code: int = args.run(args)
+    except MemoryError:
+        raise InputError(f"memory is full: {_smaller(args)}") from None
     if code == 0 and getattr(args, "recommends", False):
         _print_how_to_call()
     return code
+
+
+def _smaller(args: argparse.Namespace) -> str:
+    """Return what makes a command need less memory: those of its options that do."""
+    options = [f"--{name}" for name in SMALLER if hasattr(args, name)]
+    return f"give less at a time ({', '.join(options)})" if options else "close other programs, or give smaller input"
 
 
 def _print_how_to_call() -> None:

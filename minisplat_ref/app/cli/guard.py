@@ -47,7 +47,7 @@ def run_guarded(work: Callable[[], int], program: str = "minisplat-ref") -> int:
             print(f"{program}: error: {_missing(package)}", file=sys.stderr)
             return 2
         except MemoryError:
-            print(f"{program}: error: memory is full: give less at a time (--downscale, --size)", file=sys.stderr)
+            print(f"{program}: error: memory is full: close other programs, or give smaller input", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print(f"{program}: interrupted", file=sys.stderr)

@@ -70,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
     scene, trained = folder / SCENE, folder / RUN
     if not args.photos.is_dir() and not is_video(args.photos):
         raise InputError(f"{args.photos} is no folder: give the folder of your photographs, or a video")
+    if args.downscale is not None and args.photos.is_dir() and not scene.exists():
+        _check_downscale(args.photos, args.downscale)
     up = () if args.up is None else ("--up", args.up)
     if not scene.exists():
         matching = () if args.matching is None else ("--matching", args.matching)
@@ -91,6 +93,17 @@ def run(args: argparse.Namespace) -> int:
         write_report(trained, photographs, run_folder.read_json_object(metrics), shown)
     print_results(trained, report, folder)
     return 0
+
+
+def _check_downscale(photos: Path, factor: int) -> None:
+    """Refuse a factor that leaves next to no pixels, before cameras are looked for."""
+    from minisplat_ref.app.cli.sfm import LONG_SIDE
+    from minisplat_ref.datasets.photo_files import list_images
+    from minisplat_ref.io.images import check_downscale, image_size
+
+    shares = ((size, min(1.0, LONG_SIDE / max(size))) for size in map(image_size, list_images(photos)))
+    sizes = [(round(share * size[0]), round(share * size[1])) for size, share in shares]
+    check_downscale(photos, sizes, factor)
 
 
 def _choose_factor(scene: Path) -> int:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from minisplat_ref.datasets.sfm.mapping import Mapped
     from minisplat_ref.datasets.sfm.photographs import Group
 
+LONG_SIDE = 1600  # pixels
 FEATURES = ("auto", "standard", "dense")
 MATCHINGS = ("exhaustive", "sequential")
 CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -44,7 +45,11 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("photos", type=Path, metavar="PHOTOS", help="folder of photographs, or a video")
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="new folder for the scene")
     parser.add_argument(
-        "--long-side", type=int, default=1600, metavar="PX", help="shrink larger photographs to this (default 1600)"
+        "--long-side",
+        type=int,
+        default=LONG_SIDE,
+        metavar="PX",
+        help=f"shrink larger photographs to this (default {LONG_SIDE})",
     )
     parser.add_argument(
         "--features",

@@ -68,7 +68,7 @@ def add_parser(commands: Commands) -> None:
         "--check-every", type=integer(1), metavar="K", help="look for NaN every K steps (10); --drop-bad-steps: skip"
     )
     add_settings(training, "drop_bad_steps", "profile", "backend")
-    parser.set_defaults(run=run, needs=("matplotlib",), recommends=True)
+    parser.set_defaults(run=run, recommends=True)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from minisplat_ref.app.reports.colormaps import N_LEVELS, table
 from minisplat_ref.types import Floats
 
 Image8 = NDArray[np.uint8]  # [H, W, 3] sRGB
@@ -41,11 +42,10 @@ def depth_range(depth: Floats) -> tuple[float, float]:
 
 def colorize(values: Floats, low: float, high: float, colormap: str) -> Image8:
     """Colour values [H, W] with a map from ``low`` to ``high``, in either order."""
-    from matplotlib import colormaps  # not at the top: a training would wait for it before its first iteration
-
     fractions = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)  # [H, W]
-    image: Image8 = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
-    return image
+    colors = np.rint(table(colormap)).astype(np.uint8)  # [256, 3]
+    levels = np.minimum((fractions * N_LEVELS).astype(np.int64), N_LEVELS - 1)  # [H, W]
+    return colors[levels]
 
 
 def side_by_side(images: list[Image8]) -> Image8:

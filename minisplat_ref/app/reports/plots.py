@@ -1,19 +1,20 @@
-"""Curves in one style, as inline SVG for a page and as PNG files."""
+"""Curves in one style, by matplotlib, as inline SVG for a page and as PNG files."""
 
 import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import escape
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
-
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.interface.palette import EDGE_COLOR, GRID_COLOR, PAGE_NAMES, PNG_DPI, TICK_COLOR, TITLE_COLOR
 from minisplat_ref.io.atomic import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 PLOT_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: smaller, and in the page's own font
@@ -32,8 +33,13 @@ PLOT_STYLE: dict[Any, Any] = {
 }
 
 
+def can_plot() -> bool:
+    """Return whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
 @contextmanager
-def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> Iterator[tuple[Figure, Axes]]:
+def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> "Iterator[tuple[Figure, Axes]]":
     """Return a new figure and its axes.
 
     Parameters
@@ -44,6 +50,9 @@ def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> It
     size : pair of float
         Width and height, inches.
     """
+    from matplotlib import rc_context  # not at the top: a training, whose report may lack curves, needs it not
+    from matplotlib.figure import Figure
+
     with rc_context(PLOT_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots()
@@ -53,8 +62,10 @@ def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> It
         yield figure, axes
 
 
-def to_svg(figure: Figure) -> str:
+def to_svg(figure: "Figure") -> str:
     """Return the figure as an element of a page, in the page's colours, named after the titles of its axes."""
+    from matplotlib import rc_context
+
     buffer = io.StringIO()
     no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with rc_context(PLOT_STYLE):
@@ -69,7 +80,9 @@ def to_svg(figure: Figure) -> str:
     return svg.replace("<svg", f'<svg role="img" aria-label="{escape(titles)}"', 1)
 
 
-def save_png(figure: Figure, path: Path) -> None:
+def save_png(figure: "Figure", path: Path) -> None:
     """Write the figure on white."""
+    from matplotlib import rc_context
+
     with rc_context(PLOT_STYLE), replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=PNG_DPI, facecolor="white")

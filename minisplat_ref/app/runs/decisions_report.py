@@ -4,15 +4,18 @@ Most are those of ``adaptive`` (:mod:`minisplat_ref.training.pace`); each has it
 """
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from minisplat_ref.app.reports.page import curves, paragraph, section, table
-from minisplat_ref.app.reports.plots import plot, to_svg
+from minisplat_ref.app.reports.plots import can_plot, plot, to_svg
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DONE = {
     COOLED: "the learning rates began to fall",
@@ -48,7 +51,7 @@ def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = Fal
     """
     text = story(pace, n_iterations, has_schedule=has_schedule)
     parts = [paragraph(text)] if text else []
-    if pace.measurements:
+    if pace.measurements and can_plot():
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
         is_by_slope = any(_is_of_slope(decision) for decision in pace.decisions)
         is_of_sizes = any(decision.what == FINER for decision in pace.decisions)
@@ -101,7 +104,7 @@ def _row(decision: Decision) -> list[str]:
     return [f"{decision.what}{effect}", f"{decision.step:,}", decision.why, *numbers]
 
 
-def over_iterations(pace: Pace) -> Figure:
+def over_iterations(pace: Pace) -> "Figure":
     """Plot the PSNR of the held-out views over the iterations, with the decisions."""
     with plot(PSNR, "iterations", (5.6, 3.6)) as (figure, axes):
         for part in _group_by_size(pace):
@@ -113,7 +116,7 @@ def over_iterations(pace: Pace) -> Figure:
     return figure
 
 
-def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
+def _name_decisions(axes: "Axes", decisions: tuple[Decision, ...]) -> None:
     """Write each decision at the foot of its line; decisions of nearly the same iteration share one label."""
     labels: dict[int, list[str]] = {}
     for decision in decisions:
@@ -134,7 +137,7 @@ def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
         )
 
 
-def over_work(pace: Pace) -> Figure:
+def over_work(pace: Pace) -> "Figure":
     """Plot the same over the work; the gain is counted for each doubling of it."""
     with plot(PSNR, "work (pairs of tile and Gaussian)", (5.6, 3.6)) as (figure, axes):
         for part in _group_by_size(pace):
@@ -151,12 +154,12 @@ def _is_of_slope(decision: Decision) -> bool:
     return decision.what in (COOLED, FINER) and decision.gain is not None
 
 
-def _draw(axes: Axes, measurements: tuple[Measurement, ...], xs: list[float]) -> None:
+def _draw(axes: "Axes", measurements: tuple[Measurement, ...], xs: list[float]) -> None:
     axes.plot(xs, np.array([m.psnrs for m in measurements]), color=BLUE, linewidth=0.6, alpha=0.45)
     axes.plot(xs, [m.psnr for m in measurements], color=BLUE, linewidth=2.2, marker="o", markersize=3)
 
 
-def _draw_slope(axes: Axes, recent: list[Measurement], gain: float) -> None:
+def _draw_slope(axes: "Axes", recent: list[Measurement], gain: float) -> None:
     """Plot the line through measurements whose slope is ``gain`` dB for each doubling of the work."""
     doublings = np.log2([m.n_pairs for m in recent])
     middle = np.mean([m.psnr for m in recent])

@@ -8,6 +8,7 @@ from minisplat_ref import __version__
 from minisplat_ref.app.reports.commands import command, how_to_call
 from minisplat_ref.app.reports.images import fit_image, split_images
 from minisplat_ref.app.reports.page import add_caption, cards, code, curves, folded, page, paragraph, section, table
+from minisplat_ref.app.reports.plots import can_plot
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.decisions_report import decisions_section
 from minisplat_ref.app.runs.events import count_published_times, read_mechanisms
@@ -35,6 +36,7 @@ PSNRS = ("psnr", "psnr_exposed", "psnr_corrected")
 BLOCKS_TEXT = """\
 The scene was trained in blocks, each from the photographs in which it fills a quarter of the pixels. Of each block,
 this model has what lies in its core. The blocks' own pages are in the folder blocks."""
+NO_CURVES = "Curves are drawn by matplotlib: pip install 'minisplat_ref[photos]'. Their numbers are in log.jsonl."
 FIRED_TEXT = """\
 What the recipe does besides gradient steps, in this run: how often, in how many steps as published, when, and by how
 many Gaussians their number rose or fell."""
@@ -163,6 +165,8 @@ def _describe_measures(view: dict[str, Any]) -> str:
 
 
 def _curves(folder: Path, log: list[dict[str, Any]]) -> str:
+    if not can_plot():
+        return paragraph(NO_CURVES)
     measured = read_log(folder / run_folder.CURVE)
     if not measured:
         return curves(training_curves(log))

@@ -13,6 +13,7 @@ from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.sparse_points import sample_points
 from minisplat_ref.datasets.synthetic.tracer import TracedView, World, trace_view
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import suggest
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
 
 __all__ = ["SCENE_NAMES", "SyntheticScene", "make_scene"]
@@ -95,7 +96,7 @@ def make_scene(
         An unknown name or a number out of range.
     """
     if name not in SETTINGS:
-        raise InputError(f"there is no synthetic scene {name!r}; choose one of {', '.join(SCENE_NAMES)}")
+        raise InputError(f"there is no synthetic scene {name!r}{suggest(name, SCENE_NAMES)}")
     _at_least(0, seed=seed, n_points=n_points, test_every=test_every)
     _at_least(1, supersampling=supersampling)
     _at_least(2, n_views=n_views)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, PROFILES, Conventions
 from minisplat_ref.errors import InputError
+from minisplat_ref.interface.arguments import did_you_mean
 from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
 from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
 from minisplat_ref.oracle.golden.running import run_stages
@@ -188,6 +189,15 @@ def choose_renderer(name: str, dtype: str | None) -> ComparedRenderer:
         return OTHERS[name]()
     if Path(name).is_dir():
         return from_dumps(name, dtype)
+    from minisplat_ref.oracle.peers.named_function import functions_of_module
+
+    if functions := functions_of_module(name):
+        chosen = "rasterization" if "rasterization" in functions else functions[0]
+        others = f", or another of its functions: {', '.join(functions)}" if len(functions) > 1 else ""
+        raise InputError(f"{name} is a module, of which one function is compared: give {name}:{chosen}{others}")
+    named = (*BACKENDS, CUDA, CUDA_ATOMIC, "gsplat-torch", *OTHERS, *(f"planted:{error.name}" for error in PLANTED))
+    if meant := did_you_mean(name, named):
+        raise InputError(f"{name!r} is neither a folder of dumps nor a renderer{meant}")
     errors = ", ".join(error.name for error in PLANTED)
     raise InputError(
         f"{name!r} is neither a folder of dumps nor a renderer: package.module:function, {', '.join(BACKENDS)},"

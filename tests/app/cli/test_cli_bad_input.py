@@ -226,7 +226,7 @@ def test_out_below_a_file(refused, tmp_path):
         (["--set", "exposure=yes"], "exposure=yes: choose from none, tracks, refined, learned"),
         (["--set", "pose=yes"], "pose=yes is neither true nor false"),
         (["--set", "threshold=x"], "threshold=x is not a number"),
-        (["--set", "thresholds=1", *RECIPE], "no thresholds to set: choose from antialiasing, "),
+        (["--set", "thresholds=1", *RECIPE], "no thresholds to set; did you mean threshold?"),
         (["--extension", "none"], "extension 'none' does not exist: choose from "),
     ],
 )
