@@ -53,7 +53,7 @@ def assert_matches_oracle(
     profile : Conventions
         Its rules, where the scenes leave a choice, such as ``GSPLAT_1_5``, which clamps alpha at 0.999.
     has_gradients : bool
-        Whether it is a failure to give none.
+        Whether gradients are compared, and it is a failure to give none; otherwise images and meta alone are.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def assert_matches_oracle(
         If the function cannot be called like gsplat's, or returns arrays of other shapes.
     """
     __tracebackhide__ = True  # pytest shows the line of the test
-    renderer = from_function(function, vjp, arrays=arrays, dtype=dtype, profile=profile)
+    renderer = from_function(function, vjp, arrays=arrays, dtype=dtype, profile=profile, has_gradients=has_gradients)
     rows = []
     for name in scenes:
         truths, left_out = choose_scenes(renderer, name, "reference", None)

@@ -19,11 +19,12 @@ from minisplat_ref.io.npz import read_npz
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.peers.array_kinds import kind_of
 from minisplat_ref.oracle.peers.named_function import load_function
+from minisplat_ref.oracle.tangent import on_tangent
 from minisplat_ref.oracle.tolerances import EXACT, StageTolerance
 from minisplat_ref.types import Floats
 
 Arrays = dict[str, np.ndarray]
-POSE = "viewmats"
+POSE, V_POSE = "viewmats", "v_viewmats"
 
 
 class CallScene(NamedTuple):
@@ -200,6 +201,9 @@ def compare(call: Call, renderer: CallRenderer, scenes: Mapping[str, tuple[CallS
             if about.is_of_rows and np.shape(got) == np.shape(ours):
                 is_given = _is_given(ours, known["radii"], arrays.get("radii"))
                 got, ours = np.where(is_given, got, 0), np.where(is_given, ours, 0)
+            if name == V_POSE and np.shape(got) == np.shape(ours):
+                views = scene.arguments[POSE]
+                got, ours = on_tangent(got, views), on_tangent(ours, views)
             case = _case(name, about, scene.name, got, ours, renderer.dtype)
             if name not in worst or _ratio(case) > _ratio(worst[name]):
                 worst[name] = case

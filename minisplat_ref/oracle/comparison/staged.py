@@ -24,6 +24,7 @@ from minisplat_ref.oracle.comparison.signatures import (
 )
 from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, Golden, names_of
 from minisplat_ref.oracle.renderer import ComparedRenderer
+from minisplat_ref.oracle.tangent import on_tangent, turning
 from minisplat_ref.types import NOTHING, Bools
 
 Status = Literal["agrees", "diverges", "harmless", "not given"]
@@ -74,6 +75,8 @@ ONE_FUNCTION = {"features": "composite", "statistics": "composite"}
 FLIPPING = ("T", "image", "features", "statistics", "median depth", "view")  # flips are counted
 SLIGHT = 5.0  # times the tolerance, up to which a difference in few values counts as rounding
 FEW = 0.01  # of the values of the arrays that are off
+OF_ROTATION = ("v_R_projection", "v_R_colors", "v_R")
+OF_VIEW = ("v_viewmat",)
 BY_ROW = ("means2d", "depths", "conics", "opacities2d", "colors")  # compared where both show the Gaussian
 
 
@@ -227,8 +230,8 @@ def _row_of_arrays(
     if not found:
         return Row(truth.name, stage, "not given", None)
     differences, marks = {}, {}
-    for name in found:
-        a, b = given[name], truth.arrays[name]
+    compared = {name: _compared(name, given[name], truth) for name in found}
+    for name, (a, b) in compared.items():
         if name in BY_ROW:
             rows = truth.arrays["radii"][:, 0] > 0
             if "radii" in given:
@@ -239,7 +242,7 @@ def _row_of_arrays(
         marks[name] = mark(a, b, is_wrong=d.n_over > 0, set_aside=may_flip.get(name))
     worst = max(differences, key=lambda name: differences[name].excess)
     d = differences[worst]
-    notes = [worst if len(names) > 1 and d.n_over else "", _shape_of_error(given[worst], truth.arrays[worst], d)]
+    notes = [worst if len(names) > 1 and d.n_over else "", _shape_of_error(*compared[worst], d)]
     wrong = tuple(name for name, of_array in differences.items() if of_array.n_over)
     return Row(
         truth.name,
@@ -251,6 +254,17 @@ def _row_of_arrays(
         arrays=wrong,
         marks=marks,
     )
+
+
+def _compared(name: str, given: np.ndarray, truth: Golden) -> tuple[np.ndarray, np.ndarray]:
+    """Return the other renderer's array and the truth's; of gradients of a view, their part on the tangent of SE(3)."""
+    expected, camera = truth.arrays[name], truth.camera
+    if name in OF_ROTATION:
+        return turning(given, camera.cam_from_world_R), turning(expected, camera.cam_from_world_R)
+    if name in OF_VIEW:
+        view = np.column_stack([camera.cam_from_world_R, camera.cam_from_world_t])
+        return on_tangent(given, view), on_tangent(expected, view)
+    return given, expected
 
 
 def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> str:

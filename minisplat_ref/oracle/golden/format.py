@@ -152,7 +152,16 @@ _SPECS: tuple[tuple[Any, ...], ...] = (
     ("v_opacities_view", "view", "gradient", ("N",), "float64", "1", "dV/d opacities", GRADIENT),
     ("v_sh_dc_view", "view", "gradient", ("N", 3), "float64", "1", "dV/d sh_dc", GRADIENT),
     ("v_sh_rest_view", "view", "gradient", ("N", "R", 3), "float64", "1", "dV/d sh_rest", GRADIENT),
-    ("v_viewmat", "view", "gradient", (3, 4), "float64", "1", "dV/d (R, t), twelve free entries", GRADIENT),
+    (
+        "v_viewmat",
+        "view",
+        "gradient",
+        (3, 4),
+        "float64",
+        "1",
+        "dV/d (R, t), twelve entries; six are compared",
+        GRADIENT,
+    ),
     ("v_background_view", "view", "gradient", (3,), "float64", "1", "dV/d background", GRADIENT),
     ("adam_values", "adam", "input", ("A", "P"), "float64", "1", "parameters", EXACT),
     ("adam_gradient", "adam", "input", ("A", "P"), "float64", "1", "g, their gradient", EXACT),
@@ -305,8 +314,8 @@ The other stages are each by itself; nothing of L depends on them:
   Mahalanobis distance from its mean; 0 where there is none or it lies behind the camera. The gradients are those of
   S = sum(v_surface_points * surface_points) + sum(v_surface_depths * surface_depths).
 - `view`: the whole renderer in one call. Its last channel is the expected depth, accumulated depth / alpha. Its
-  gradients are those of V = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_expected_depth * expected depth). With
-  the camera's centre taken as -R^-1 t, the twelve entries of (R, t) are free.
+  gradients are those of V = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_expected_depth * expected depth). The
+  camera's centre is taken as -R^-1 t, and the twelve entries of (R, t) as free.
 - `adam`: one step, m <- beta1 m + (1 - beta1) g and v <- beta2 v + (1 - beta2) g^2, then
   p <- p - rate m' / (sqrt(v') + eps) with m' = m / (1 - beta1^k) and v' = v / (1 - beta2^k).
 
@@ -314,8 +323,9 @@ In a scene that is called exact, some values equal their thresholds in binary (a
 float64 no rounding is an excuse there: it shows what a renderer does at equality.
 
 `b` of a conic occurs twice in its matrix; `v_conics[:, 1]` is the derivative with respect to b itself and holds both.
-Pose gradients are with respect to the nine entries of R as if they were free. Skips, stops, boxes and the order of the
-Gaussians count as fixed.
+Pose gradients are with respect to the nine entries of R as if they were free; compared is their part on the tangent of
+SE(3), vee(R^T v_R) and v_t, in which a camera centre of -R^T t makes no difference. Skips, stops, boxes and the order of
+the Gaussians count as fixed.
 
 ## Stages
 

@@ -18,6 +18,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.types import Floats
 
 ARRAY_KINDS = ("numpy", "torch", "jax")
+QUICK = {"xla_backend_optimization_level": 0}  # a scene is rendered once: XLA takes longer to optimise than to run
 INTERMEDIATE = ("means2d", "depths", "conics", "opacities")  # of the meta, that torch may differentiate by
 
 
@@ -57,7 +58,14 @@ def kind_of(function: Callable[..., Any]) -> str:
     return next((kind for kind in ("torch", "jax") if kind in roots), "numpy")
 
 
-def run(kind: str, function: Callable[..., Any], vjp: Callable[..., Any] | None, call: Call) -> Result:
+def run(
+    kind: str,
+    function: Callable[..., Any],
+    vjp: Callable[..., Any] | None,
+    call: Call,
+    *,
+    has_gradients: bool = True,
+) -> Result:
     """Call a rasterizer forward and, if it can be differentiated, backward.
 
     Parameters
@@ -70,6 +78,8 @@ def run(kind: str, function: Callable[..., Any], vjp: Callable[..., Any] | None,
         on.
     call : Call
         All of it in one dtype.
+    has_gradients : bool
+        Whether to compute gradients at all.
 
     Raises
     ------
@@ -78,8 +88,11 @@ def run(kind: str, function: Callable[..., Any], vjp: Callable[..., Any] | None,
     """
     dtype = next(iter(call.leaves.values())).dtype
     with _jax_precision(dtype) if kind == "jax" else nullcontext():
-        result = {"numpy": _run_numpy, "torch": _run_torch, "jax": _run_jax}[kind](function, call, vjp is None)
-        return result if vjp is None else result._replace(gradients=_own_gradients(kind, vjp, call))
+        run_kind = {"numpy": _run_numpy, "torch": _run_torch, "jax": _run_jax}[kind]
+        result = run_kind(function, call, has_gradients and vjp is None)
+        if vjp is None or not has_gradients:
+            return result
+        return result._replace(gradients=_own_gradients(kind, vjp, call))
 
 
 def _own_gradients(kind: str, vjp: Callable[..., Any], call: Call) -> dict[str, np.ndarray]:
@@ -118,18 +131,35 @@ def _run_torch(function: Callable[..., Any], call: Call, is_differentiated: bool
 
 
 def _run_jax(function: Callable[..., Any], call: Call, is_differentiated: bool) -> Result:
+    """Compile the function with its gradient; one that cannot be traced is called as it is."""
     import jax
 
     leaves = {name: _to_jax(value) for name, value in call.leaves.items()}
     others = {name: _to_jax(v) if isinstance(v, np.ndarray) else v for name, v in call.others.items()}
-    colors, alphas, meta = _parts(function(**leaves, **others))
-    gradients = {}
-    if is_differentiated and colors.shape == call.v_colors.shape and alphas.shape == call.v_alphas.shape:
-        _, pull = jax.vjp(lambda given: _parts(function(**given, **others))[:2], leaves)
+
+    def forward(given: Mapping[str, Any]) -> tuple[tuple[Any, Any], dict[str, Any]]:
+        colors, alphas, meta = _parts(function(**given, **others))
+        return (colors, alphas), {name: _to_jax(meta[name]) for name in _TOLD if meta.get(name) is not None}
+
+    def both(given: Mapping[str, Any], v_colors: Any, v_alphas: Any) -> tuple[Any, Any, dict[str, Any], dict[str, Any]]:
+        if not is_differentiated:
+            (colors, alphas), told = forward(given)
+            return colors, alphas, told, {}
+        (colors, alphas), pull, told = jax.vjp(forward, given, has_aux=True)
+        if colors.shape != v_colors.shape or alphas.shape != v_alphas.shape:
+            return colors, alphas, told, {}
         # A cotangent has to have the dtype of its output, which may differ from that of the arguments.
-        cotangents = _to_jax(call.v_colors).astype(colors.dtype), _to_jax(call.v_alphas).astype(alphas.dtype)
-        gradients = {name: _numpy(v) for name, v in pull(cotangents)[0].items()}
-    return Result(_numpy(colors), _numpy(alphas), _list_arrays(meta), gradients, {})
+        (gradients,) = pull((v_colors.astype(colors.dtype), v_alphas.astype(alphas.dtype)))
+        return colors, alphas, told, gradients
+
+    arguments = leaves, _to_jax(call.v_colors), _to_jax(call.v_alphas)
+    try:
+        compiled = jax.jit(both, compiler_options=QUICK)
+        colors, alphas, told, gradients = compiled(*arguments)
+    except (jax.errors.JAXTypeError, jax.errors.JAXIndexError):  # it looks at values while it is traced
+        colors, alphas, told, gradients = both(*arguments)
+    named = {name: _numpy(value) for name, value in gradients.items()}
+    return Result(_numpy(colors), _numpy(alphas), _list_arrays(told), named, {})
 
 
 def _jax_precision(dtype: np.dtype) -> AbstractContextManager[Any]:
@@ -155,10 +185,10 @@ def _parts(returned: Any) -> tuple[Any, Any, Mapping[str, Any]]:
 
 
 def _list_arrays(meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    return {name: _numpy(meta[name]) for name in (*INTERMEDIATE, *_TOLD) if meta.get(name) is not None}
+    return {name: _numpy(meta[name]) for name in _TOLD if meta.get(name) is not None}
 
 
-_TOLD = ("radii", "flatten_ids", "isect_offsets", "tile_size")
+_TOLD = (*INTERMEDIATE, "radii", "flatten_ids", "isect_offsets", "tile_size")
 
 
 def _requires_grad(value: Any) -> bool:

@@ -40,6 +40,8 @@ class Rasterizer(NamedTuple):
     """The kind of its arguments: ``numpy``, ``torch`` or ``jax``."""
     accepts: Callable[[str], bool]
     """Whether it has a parameter of this name."""
+    has_gradients: bool
+    """Whether its gradients are compared."""
 
 
 def from_function(
@@ -50,6 +52,7 @@ def from_function(
     arrays: str | None = None,
     dtype: str = "float32",
     profile: Conventions = GSPLAT_MAIN,
+    has_gradients: bool = True,
 ) -> ComparedRenderer:
     """Compare a function.
 
@@ -69,6 +72,8 @@ def from_function(
         The dtype of its computation.
     profile : Conventions
         Its rules, where the scenes leave a choice: how alpha is clamped, for example.
+    has_gradients : bool
+        Whether its gradients are compared; otherwise images and meta alone.
 
     Raises
     ------
@@ -78,7 +83,8 @@ def from_function(
     called = name or str(getattr(function, "__qualname__", type(function).__name__))
     if arrays is not None and arrays not in ARRAY_KINDS:
         raise InputError(f"arrays {arrays!r} are unknown; choose one of {', '.join(ARRAY_KINDS)}")
-    rasterizer = Rasterizer(called, function, vjp, arrays or kind_of(function), _parameters(function, called))
+    kind = arrays or kind_of(function)
+    rasterizer = Rasterizer(called, function, vjp, kind, _parameters(function, called), has_gradients)
     rules = rules_of(profile)
 
     def drawn(asked: Conventions) -> Conventions | None:
@@ -223,7 +229,7 @@ def _call(
     call = Call({name: np.ascontiguousarray(x, dtype) for name, x in leaves.items()}, others, *cotangents)
     where = f"{rasterizer.name}, scene {truth.name}, render_mode {mode}"
     try:
-        result = run(rasterizer.kind, rasterizer.function, rasterizer.vjp, call)
+        result = run(rasterizer.kind, rasterizer.function, rasterizer.vjp, call, has_gradients=rasterizer.has_gradients)
     except NotImplementedError as error:
         if mode != "RGB":
             return None
