@@ -12,20 +12,12 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.comparison.doubts import doubts
+from minisplat_ref.oracle.comparison.hints import Hint, Scene, find_hints, in_words
 from minisplat_ref.oracle.comparison.measures import Bounds, Difference, compare_bounds, compare_lists, difference
-from minisplat_ref.oracle.comparison.signatures import (
-    GRADIENTS,
-    INTERMEDIATE,
-    Mark,
-    in_words,
-    likeliest,
-    mark,
-    signature,
-)
+from minisplat_ref.oracle.comparison.trials import BY_ROW, NOT_OF_FAULTS, Evidence, comparable
 from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, Golden, names_of
 from minisplat_ref.oracle.renderer import ComparedRenderer
-from minisplat_ref.oracle.tangent import on_tangent, turning
-from minisplat_ref.types import NOTHING, Bools
+from minisplat_ref.types import Bools
 
 Status = Literal["agrees", "diverges", "harmless", "not given"]
 
@@ -74,10 +66,8 @@ ONE_FUNCTION = {"features": "composite", "statistics": "composite"}
 """Stages of the golden format that a function of another stage computes."""
 FLIPPING = ("T", "image", "features", "statistics", "median depth", "view")  # flips are counted
 SLIGHT = 5.0  # times the tolerance, up to which a difference in few values counts as rounding
+CLEAR = 0.1  # of the largest error, from which on a scene shows it as well
 FEW = 0.01  # of the values of the arrays that are off
-OF_ROTATION = ("v_R_projection", "v_R_colors", "v_R")
-OF_VIEW = ("v_viewmat",)
-BY_ROW = ("means2d", "depths", "conics", "opacities2d", "colors")  # compared where both show the Gaussian
 
 
 class Row(NamedTuple):
@@ -96,8 +86,8 @@ class Row(NamedTuple):
     """Names of those that diverge."""
     note: str = ""
     """One line."""
-    marks: Mapping[str, Mark] = NOTHING
-    """The error of each array that was given."""
+    evidence: Evidence | None = None
+    """What the renderer gave for the whole scene."""
 
 
 def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
@@ -123,6 +113,7 @@ def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
     given = renderer.arrays(truth)
     _check_shapes(renderer, given, truth)
     may_flip = doubts(truth)
+    evidence = Evidence(given, truth, may_flip, renderer.dtype, renderer.is_staged)
     rows: list[Row] = []
     for stage, names in STAGES.items():
         if stage == "radii":
@@ -134,7 +125,7 @@ def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
         first = next((r for r in rows if r.status == "diverges"), None)
         if row.status == "diverges" and first is not None:
             row = row._replace(note=", ".join(filter(None, [row.note, _relation(renderer, row, first)])))
-        rows.append(row)
+        rows.append(row._replace(evidence=evidence))
     if all(row.status == "not given" for row in rows):
         raise InputError(f"{renderer.name} gives no array of scene {truth.name}: there is nothing to compare")
     return rows
@@ -209,13 +200,12 @@ def _check_shapes(renderer: ComparedRenderer, given: Arrays, truth: Golden) -> N
 def _row_of_bounds(scene: str, stage: str, bounds: Bounds | None) -> Row:
     if bounds is None:
         return Row(scene, stage, "not given", None)
-    marks = {STAGES[stage][0]: Mark(bounds.changes_image)}
     if bounds.n_different == 0:
-        return Row(scene, stage, "agrees", None, bounds, marks=marks)
+        return Row(scene, stage, "agrees", None, bounds)
     if bounds.changes_image:
         note = f"{bounds.note}; the image changes"
-        return Row(scene, stage, "diverges", None, bounds, note=note, arrays=STAGES[stage], marks=marks)
-    return Row(scene, stage, "harmless", None, bounds, note=f"{bounds.note}; same image", marks=marks)
+        return Row(scene, stage, "diverges", None, bounds, note=note, arrays=STAGES[stage])
+    return Row(scene, stage, "harmless", None, bounds, note=f"{bounds.note}; same image")
 
 
 def _row_of_arrays(
@@ -229,8 +219,8 @@ def _row_of_arrays(
     found = [name for name in names if name in given]
     if not found:
         return Row(truth.name, stage, "not given", None)
-    differences, marks = {}, {}
-    compared = {name: _compared(name, given[name], truth) for name in found}
+    differences = {}
+    compared = {name: comparable(name, given[name], truth) for name in found}
     for name, (a, b) in compared.items():
         if name in BY_ROW:
             rows = truth.arrays["radii"][:, 0] > 0
@@ -238,8 +228,7 @@ def _row_of_arrays(
                 rows = rows & (given["radii"].reshape(len(rows), -1)[:, 0] > 0)
             a, b = a[rows], b[rows]
         tolerance = SPECS[name].tolerance.of(renderer.dtype or given[name].dtype)
-        d = differences[name] = difference(a, b, tolerance, may_flip.get(name))
-        marks[name] = mark(a, b, is_wrong=d.n_over > 0, set_aside=may_flip.get(name))
+        differences[name] = difference(a, b, tolerance, may_flip.get(name))
     worst = max(differences, key=lambda name: differences[name].excess)
     d = differences[worst]
     notes = [worst if len(names) > 1 and d.n_over else "", _shape_of_error(*compared[worst], d)]
@@ -252,19 +241,7 @@ def _row_of_arrays(
         n_candidates=int(may_flip[names[0]].sum()) if stage in FLIPPING else 0,
         note=", ".join(filter(None, notes)),
         arrays=wrong,
-        marks=marks,
     )
-
-
-def _compared(name: str, given: np.ndarray, truth: Golden) -> tuple[np.ndarray, np.ndarray]:
-    """Return the other renderer's array and the truth's; of gradients of a view, their part on the tangent of SE(3)."""
-    expected, camera = truth.arrays[name], truth.camera
-    if name in OF_ROTATION:
-        return turning(given, camera.cam_from_world_R), turning(expected, camera.cam_from_world_R)
-    if name in OF_VIEW:
-        view = np.column_stack([camera.cam_from_world_R, camera.cam_from_world_t])
-        return on_tangent(given, view), on_tangent(expected, view)
-    return given, expected
 
 
 def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> str:
@@ -294,9 +271,6 @@ def as_report(renderer: ComparedRenderer, rows: list[Row], settings: Mapping[str
         if first is None
         else f"the first stage that diverges is {first.stage}, in scene {first.scene}{unknown}"
     )
-    found = signature(marks_by_scene(rows))
-    likely = likeliest(found, scenes, is_fed=renderer.is_staged)
-    missing = [array for array in (*INTERMEDIATE, *GRADIENTS) if array not in found]
     where = f"scene {scenes[0]}" if len(scenes) == 1 else f"{len(scenes)} scenes"
     cases = [_case([row for row in rows if row.stage == stage], first) for stage in given]
     details = [{"scene": row.scene, "stage": row.stage, "result": row.status, **_figures([row])} for row in rows]
@@ -308,25 +282,49 @@ def as_report(renderer: ComparedRenderer, rows: list[Row], settings: Mapping[str
             "renderer": renderer.name,
             "fed_with_truth": renderer.is_staged,
             "not_given": [stage for stage in STAGES if stage not in given],
-            "looks_like": slight(rows) or (in_words(found, likely, missing) if likely else []),
+            "looks_like": slight(rows) or hints_of(rows)[1],
             "first_divergence": None if first is None else {"stage": first.stage, "scene": first.scene},
             "scenes": [{k: _finite(v) for k, v in detail.items()} for detail in details],
         },
     )
 
 
-def marks_by_scene(rows: Iterable[Row]) -> dict[str, dict[str, Mark]]:
-    """Return the marks of rows by scene, then array."""
-    marks: dict[str, dict[str, Mark]] = {}
+def hints_of(rows: Iterable[Row]) -> tuple[list[Hint], list[str]]:
+    """Return the planted faults that look like what differs, the likeliest first, and lines that say so.
+
+    Both are empty where nothing differs, or nothing that a fault could change.
+    """
+    rows = list(rows)
+    first = first_divergence(rows)
+    if first is None:
+        return [], []
+    scenes = {row.scene: Scene(row.evidence, frozenset()) for row in rows if row.evidence is not None}
     for row in rows:
-        marks.setdefault(row.scene, {}).update(row.marks)
-    return marks
+        if row.scene in scenes and row.status == "diverges":
+            scenes[row.scene] = scenes[row.scene]._replace(wrong=scenes[row.scene].wrong | set(row.arrays))
+    compared = list(scenes.values())
+    if not any(SPECS[name].stage not in NOT_OF_FAULTS for scene in compared for name in scene.wrong):
+        return [], []
+    hints, telling = find_hints(compared, list(scenes).index(_choose_scene(rows, first, scenes)))
+    return hints, in_words(compared, hints, telling)
+
+
+def _choose_scene(rows: Iterable[Row], first: Row, scenes: Mapping[str, Scene]) -> str:
+    """Return the smallest scene that shows the first difference about as clearly as the one where it is largest."""
+    same = [row for row in rows if row.stage == first.stage and row.status == "diverges"]
+    clear = [row.scene for row in same if excess(row) >= CLEAR * excess(first)]
+
+    def work(name: str) -> int:
+        arrays = scenes[name].evidence.truth.arrays
+        return len(arrays["means"]) * int(np.prod(arrays["image_size"]))
+
+    return min(clear, key=work)
 
 
 def slight(rows: Iterable[Row]) -> list[str]:
     """Return a note if the differences are those of rounding: a few values, little above the tolerance.
 
-    An error in a formula is wrong in most values; its signature would be looked for in noise.
+    An error in a formula is wrong in most values; a fault like it would be looked for in noise.
     """
     wrong = [row for row in rows if row.status == "diverges"]
     found = [row.difference for row in wrong if row.difference is not None]

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.constants import SH_C0
-from minisplat_ref.oracle.planted import Stage, change_stages
+from minisplat_ref.constants import SH_C0, Conventions
+from minisplat_ref.oracle.planted import Stage, change_camera, change_stages
 from minisplat_ref.reference import projection as reference_projection
+from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.types import (
     Camera,
-    CompositeGradient,
     Floats,
     PrimitiveGradient,
     Projection,
-    RenderOutput,
     SHGradient,
 )
 
@@ -51,6 +50,94 @@ def with_rules(change: Callable[[Any], dict[str, Any]]) -> Backend:
 
     names = ("project", "project_vjp", "bin_gaussians", "composite", "composite_vjp")
     return change_stages(REFERENCE, **dict.fromkeys(names, follow))
+
+
+def with_positions(move: Callable[[Floats, Camera], Floats]) -> Backend:
+    """Return a backend whose projection puts the centres elsewhere, by an image that is moved as a whole."""
+
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
+        return p._replace(means2d=np.where(p.radii > 0, move(p.means2d, args[4]), 0))
+
+    return change_stages(REFERENCE, project=project)
+
+
+def with_camera(change: Callable[[Camera], Camera]) -> Backend:
+    """Return a backend that projects and shades by another camera."""
+    shaded = change_camera(REFERENCE, change)
+
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any) -> Any:
+        return stage(means, sh_dc, sh_rest, change(camera), *rest)
+
+    return change_stages(shaded, sh_colors=sh_colors, sh_colors_vjp=sh_colors)
+
+
+def with_covariances(change: Callable[[Floats, Conventions], Floats]) -> Backend:
+    """Return a backend whose covariances [N, 2, 2] in the image are others, the low-pass included."""
+
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
+        shown = p.radii[:, 0] > 0
+        Q = np.where(shown[:, None], p.conics, (1, 0, 1))[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        changed = np.linalg.inv(change(np.linalg.inv(Q), args[5]))
+        conics = np.column_stack([changed[:, 0, 0], changed[:, 0, 1], changed[:, 1, 1]])
+        return p._replace(conics=np.where(shown[:, None], conics, 0))
+
+    return change_stages(REFERENCE, project=project)
+
+
+def with_jacobians(change: Callable[[Floats], Floats]) -> Backend:
+    """Return a backend with other Jacobians [N, 2, 3]."""
+    right = vars(reference_projection)["pinhole_jacobians"]
+    return rebuilt(pinhole_jacobians=lambda *args: change(right(*args)))
+
+
+def with_rotations(change: Callable[[Floats], Floats]) -> Backend:
+    """Return a backend with other rotations [N, 3, 3] of the Gaussians, by their quaternions [N, 4]."""
+
+    def covariances(quats: Floats, scales: Floats) -> Floats:
+        M = change(quats) * scales[:, None, :]
+        return np.asarray(M @ np.swapaxes(M, 1, 2))
+
+    return rebuilt(covariances=covariances)
+
+
+def unnormalised_rotations(quats: Floats) -> Floats:
+    """Return ``1 - 2 (y^2 + z^2)`` and so on of quaternions that are not divided by their length."""
+    squares = np.sum(quats**2, axis=1)[:, None, None]
+    return np.asarray(np.eye(3) + squares * (rotation_matrices(quats) - np.eye(3)))
+
+
+def with_projected_opacities(change: Callable[[Floats], Floats]) -> Backend:
+    """Return a backend whose projection returns other opacities."""
+
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
+        return p._replace(opacities=np.where(p.radii[:, 0] > 0, change(p.opacities), 0))
+
+    return change_stages(REFERENCE, project=project)
+
+
+def with_compensations(power: float) -> Backend:
+    """Return a backend that multiplies opacities by a power of the right compensation, where there is one."""
+
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
+        plain = np.where(args[3] > 0, args[3], 1)
+        ratios = np.where(p.opacities > 0, p.opacities / plain, 1)
+        return p._replace(opacities=np.where(p.radii[:, 0] > 0, args[3] * ratios**power, 0))
+
+    return change_stages(REFERENCE, project=project)
+
+
+def with_depths(change: Callable[[Floats], Floats]) -> Backend:
+    """Return a backend whose projection returns other depths."""
+
+    def project(stage: Stage, *args: Any) -> Projection:
+        p = stage(*args)
+        return p._replace(depths=np.where(p.radii[:, 0] > 0, change(np.where(p.depths > 0, p.depths, 1)), 0))
+
+    return change_stages(REFERENCE, project=project)
 
 
 def with_scales(factor: float) -> Backend:
@@ -114,6 +201,33 @@ def with_conics(factors: tuple[float, float, float], order: tuple[int, int, int]
         return stage(*args[:-1], v._replace(conics=(v.conics * np.array(factors))[:, order]))
 
     return change_stages(REFERENCE, project=project, project_vjp=project_vjp)
+
+
+def with_primitives(scales: Callable[[Floats], Floats]) -> Backend:
+    """Return a backend that projects other scales."""
+
+    def project(stage: Stage, means: Floats, quats: Floats, given: Floats, *rest: Any) -> Projection:
+        p: Projection = stage(means, quats, scales(given), *rest)
+        return p
+
+    return change_stages(REFERENCE, project=project)
+
+
+def sorted_by_distances(_: float) -> Backend:
+    """Return a backend that sorts by distances from the camera's centre; depths themselves are right."""
+
+    def bin_gaussians(stage: Stage, projection: Projection, *rest: Any) -> Any:
+        p = projection
+        rays = (p.means2d - memory["c"]) / memory["f"]
+        return stage(p._replace(depths=p.depths * np.sqrt(1 + np.sum(rays**2, axis=1))), *rest)
+
+    def project(stage: Stage, *args: Any) -> Projection:
+        memory.update(c=np.array([args[4].cx, args[4].cy]), f=np.array([args[4].fx, args[4].fy]))
+        p: Projection = stage(*args)
+        return p
+
+    memory: dict[str, Floats] = {}  # of the camera, which the lists are made without
+    return change_stages(REFERENCE, project=project, bin_gaussians=bin_gaussians)
 
 
 def with_distances(_: float) -> Backend:
@@ -201,6 +315,49 @@ def without_highest_band(_: float) -> Backend:
     )
 
 
+def with_coefficient(k: int, factor: float) -> Backend:
+    """Return a backend with coefficient ``k`` of :attr:`sh_rest` multiplied by a factor, where there is one."""
+
+    def changed(sh_rest: Floats) -> Floats:
+        factors = np.where(np.arange(sh_rest.shape[1]) == k, factor, 1)
+        return (sh_rest * factors[None, :, None]).astype(sh_rest.dtype)
+
+    return _change_coefficients(
+        lambda sh_dc, sh_rest: (sh_dc, changed(sh_rest)), lambda v: v._replace(sh_rest=changed(v.sh_rest))
+    )
+
+
+def with_coefficients(change: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> Backend:
+    """Return a backend that shades other coefficients; its gradient is that of these."""
+    return _change_coefficients(change, lambda v: v)
+
+
+def with_colors(change: Callable[[Floats], Floats]) -> Backend:
+    """Return a backend with other colours [N, 3], after they are clamped at 0."""
+    return change_stages(REFERENCE, sh_colors=lambda stage, *args: change(stage(*args)))
+
+
+def with_directions(change: Callable[[Floats, Camera], tuple[Floats, Camera]]) -> Backend:
+    """Return a backend that shades means [N, 3] seen by a camera, both changed."""
+
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any) -> Floats:
+        seen, by = change(means, camera)
+        return np.asarray(stage(seen, sh_dc, sh_rest, by, *rest))
+
+    return change_stages(REFERENCE, sh_colors=sh_colors)
+
+
+def with_unnormalised_directions(_: float) -> Backend:
+    """Return a backend whose harmonics take ``mu - o`` itself: those of degree l grow by its length to the l."""
+
+    def sh_colors(stage: Stage, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, *rest: Any) -> Floats:
+        lengths = np.linalg.norm(means + camera.cam_from_world_t @ camera.cam_from_world_R, axis=1)[:, None, None]
+        degrees = np.floor(np.sqrt(np.arange(1, sh_rest.shape[1] + 1)))[None, :, None]
+        return np.asarray(stage(means, sh_dc, sh_rest * lengths**degrees, camera, *rest))
+
+    return change_stages(REFERENCE, sh_colors=sh_colors)
+
+
 def with_lighter_colors(by: float) -> Backend:
     """Return a backend that adds a constant to colours, before they are clamped."""
     return _change_coefficients(lambda sh_dc, sh_rest: (sh_dc + by / SH_C0, sh_rest), lambda v: v)
@@ -241,57 +398,3 @@ def with_negative_colors(_: float) -> Backend:
         return SHGradient._make(a + b for a, b in zip(v, lower, strict=True))
 
     return change_stages(REFERENCE, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
-
-
-def _change_footprints(
-    change: Callable[[Projection], Projection], back: Callable[[CompositeGradient], CompositeGradient]
-) -> Backend:
-    """Return a backend that blends other footprints."""
-
-    def composite(stage: Stage, projection: Projection, *rest: Any, **asked: bool) -> RenderOutput:
-        return stage(change(projection), *rest, **asked)
-
-    def composite_vjp(stage: Stage, projection: Projection, *rest: Any) -> CompositeGradient:
-        return back(stage(change(projection), *rest))
-
-    return change_stages(REFERENCE, composite=composite, composite_vjp=composite_vjp)
-
-
-def with_blended_conics(*factors: float) -> Backend:
-    """Return a backend that blends conics times three factors."""
-    by = np.array(factors)
-    return _change_footprints(
-        lambda p: p._replace(conics=(p.conics * by).astype(p.conics.dtype)), lambda v: v._replace(conics=v.conics * by)
-    )
-
-
-def with_blended_opacities(factor: float) -> Backend:
-    """Return a backend that blends opacities times a factor."""
-    return _change_footprints(
-        lambda p: p._replace(opacities=p.opacities * p.opacities.dtype.type(factor)),
-        lambda v: v._replace(opacities=factor * v.opacities),
-    )
-
-
-def with_background(factor: float) -> Backend:
-    """Return a backend with the background times a factor."""
-
-    def composite(
-        stage: Stage, p: Projection, colors: Floats, background: Floats, *rest: Any, **asked: bool
-    ) -> RenderOutput:
-        return stage(p, colors, factor * background, *rest, **asked)
-
-    def composite_vjp(stage: Stage, p: Projection, colors: Floats, background: Floats, *rest: Any) -> CompositeGradient:
-        v = stage(p, colors, factor * background, *rest)
-        return v._replace(background=factor * v.background)
-
-    return change_stages(REFERENCE, composite=composite, composite_vjp=composite_vjp)
-
-
-def sorted_from_behind(_: float) -> Backend:
-    """Return a backend that blends the farthest Gaussian first."""
-
-    def bin_gaussians(stage: Stage, projection: Projection, *rest: Any) -> Any:
-        return stage(projection._replace(depths=-projection.depths), *rest)
-
-    return change_stages(REFERENCE, bin_gaussians=bin_gaussians)

@@ -324,8 +324,8 @@ float64 no rounding is an excuse there: it shows what a renderer does at equalit
 
 `b` of a conic occurs twice in its matrix; `v_conics[:, 1]` is the derivative with respect to b itself and holds both.
 Pose gradients are with respect to the nine entries of R as if they were free; compared is their part on the tangent of
-SE(3), vee(R^T v_R) and v_t, in which a camera centre of -R^T t makes no difference. Skips, stops, boxes and the order of
-the Gaussians count as fixed.
+SE(3), vee(R^T v_R) and v_t, in which a camera centre of -R^T t makes no difference. Skips, stops, boxes and the order
+of the Gaussians count as fixed.
 
 ## Stages
 
