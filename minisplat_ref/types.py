@@ -49,9 +49,16 @@ class Optics(NamedTuple):
     """The lens of a camera that is no pinhole; :mod:`minisplat_ref.mechanisms.cameras` has the functions."""
 
     model: str
-    """``brown``, ``fisheye`` or ``orthographic``."""
+    """``brown``, ``fisheye``, ``orthographic`` or ``affine``."""
     coefficients: tuple[float, ...] = ()
-    """Without unit: k1 to k6, p1, p2 of ``brown``; k1 to k4 of ``fisheye``."""
+    """Without unit: k1 to k6, p1, p2 of ``brown``; k1 to k4 of ``fisheye``. Of ``affine``, in a world
+    whose z is up: the shear s in ``v = fy (y + s x) + cy``, metres per world unit, and the direction [3] to the sun,
+    zeros for none."""
+
+    @property
+    def is_parallel(self) -> bool:
+        """Whether all rays are parallel: then focal lengths are pixels per world unit, and the place says little."""
+        return self.model in ("orthographic", "affine")
 
 
 class Camera(NamedTuple):

@@ -212,6 +212,6 @@ def _write(path: Path, image: NDArray) -> None:
 def _check_distorted(source: Path, photos: Sequence[Photo]) -> None:
     """Refuse photographs that cannot be read, and scenes that have no distortion."""
     for photo in photos:
-        check_photo(photo, source, takes_lens=True)
+        check_photo(photo, source, undistort=True, as_photographed=False)
     if all(photo.lens is None for photo in photos):
         raise InputError(f"{source}: all cameras are pinholes already, nothing to undistort; use the scene as it is")

@@ -25,12 +25,20 @@ class Lens(NamedTuple):
     """A lens that is not a pinhole, in COLMAP's terms."""
 
     model: str
-    """Name of a COLMAP camera model."""
+    """Name of a COLMAP camera model, or :data:`PARALLEL_MODEL`."""
     params: tuple[float, ...]
     """Its parameters in COLMAP's order, pixels."""
 
+    @property
+    def is_parallel(self) -> bool:
+        """Whether its rays are parallel, so that no pinhole has its image."""
+        return self.model == PARALLEL_MODEL
 
-BROWN, FISHEYE = "brown", "fisheye"
+
+BROWN, FISHEYE, AFFINE = "brown", "fisheye", "affine"
+PARALLEL_MODEL = "AFFINE"
+"""The name of cameras with parallel rays in a transforms.json. Their parameters are fx, fy, cx, cy and those of optics.
+"""
 # Of each model the name of its optics, and where its parameters behind the focal lengths and the principal point go:
 # k1 to k6, p1, p2, or k1 to k4.
 COEFFICIENTS: Mapping[str, tuple[str, int, tuple[int, ...]]] = {
@@ -42,7 +50,7 @@ COEFFICIENTS: Mapping[str, tuple[str, int, tuple[int, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": (FISHEYE, 3, (0,)),
     "RADIAL_FISHEYE": (FISHEYE, 3, (0, 1)),
 }
-N_COEFFICIENTS = {BROWN: 8, FISHEYE: 4, "orthographic": 0}
+N_COEFFICIENTS = {BROWN: 8, FISHEYE: 4, "orthographic": 0, AFFINE: 5}
 
 
 def lens_optics(lens: Lens, path: Path) -> Optics:
@@ -53,6 +61,8 @@ def lens_optics(lens: Lens, path: Path) -> Optics:
     InputError
         The model is not known.
     """
+    if lens.is_parallel:
+        return Optics(AFFINE, lens.params[4:])
     if lens.model not in COEFFICIENTS:
         raise InputError(
             f"{path}: camera model {lens.model} is not one of {', '.join(COEFFICIENTS)}, which are drawn as"

@@ -5,6 +5,7 @@ detected here. All photographs are kept in memory as uint8 if they take a modera
 only sizes are checked here, and pixels are read on demand (:mod:`minisplat_ref.io.stored_views`).
 """
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -172,7 +173,7 @@ def build_scene(listing: Listing, reading: Reading) -> Scene:
             f" {TRAIN_VIEWS_MIN}; add photographs or hold out fewer"
         )
     for photo in photos:
-        check_photo(photo, source, reading.undistort or reading.as_photographed)
+        check_photo(photo, source, undistort=reading.undistort, as_photographed=reading.as_photographed)
     _check_points(points, source)
     memory.check_photograph(source, max(_n_pixels(photo) for photo in photos), reading.downscale)
     _check_places(source, [photo.camera for photo in train_photos])
@@ -237,8 +238,8 @@ def _n_bytes(photo: Photo) -> int:
     return (3 + (photo.mask_path is not None)) * _n_pixels(photo)
 
 
-def check_photo(photo: Photo, source: Path, takes_lens: bool) -> None:
-    """Raise an InputError for a photograph that cannot become a view; ``takes_lens``: one of any lens can."""
+def check_photo(photo: Photo, source: Path, *, undistort: bool, as_photographed: bool) -> None:
+    """Raise an InputError for a photograph that cannot become a view, by the arguments of :class:`Reading`."""
     camera = photo.camera
     intrinsics = np.array(camera[2:8], np.float64)
     is_small = np.abs(intrinsics).max() <= COORDINATE_MAX  # False for NaN
@@ -253,7 +254,12 @@ def check_photo(photo: Photo, source: Path, takes_lens: bool) -> None:
         is_rotation = np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(R) > 0  # False for NaN
     if not is_rotation or not np.abs(t).max() <= COORDINATE_MAX:
         raise InputError(f"{source}: the pose of {photo.file} is not a rotation and a translation; repair or remove it")
-    if photo.lens is not None and not takes_lens:
+    if photo.lens is not None and photo.lens.is_parallel and not as_photographed:
+        raise InputError(
+            f"{source}: the rays of {photo.file} are parallel (camera model {photo.lens.model}), of which no pinhole is"
+            " made: train with --recipe satellite"
+        )
+    if photo.lens is not None and not (undistort or as_photographed):
         raise InputError(
             f"{source}: {photo.file} has lens distortion (camera model {photo.lens.model}), only pinholes are rendered;"
             f" run `minisplat-ref undistort {source} --out DIR`, or train with --undistort (undistort=True in Python),"
@@ -278,7 +284,12 @@ def _check_points(points: Floats, source: Path) -> None:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Return 1.1 x the largest distance of a camera centre from the mean centre, world units."""
+    """Return 1.1 x the largest distance of a camera centre from the mean centre, world units.
+
+    Parallel rays say nothing of the place that they come from. There it is half the diagonal of the largest image.
+    """
+    if all(camera.optics is not None and camera.optics.is_parallel for camera in cameras):
+        return max(math.hypot(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras) / 2
     centers = np.stack([camera.center for camera in cameras])  # [V, 3]
     return EXTENT_MARGIN * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 

@@ -1,4 +1,4 @@
-"""Scenes described by transforms.json, in its three dialects.
+"""Scenes described by transforms.json, in its four dialects.
 
 * Blender (NeRF-synthetic): ``transforms_train.json`` and ``transforms_test.json``, one ``camera_angle_x``, square
   pixels, ``file_path`` without suffix, RGBA images, points in ``points3d.ply`` if there are any, or else random ones in
@@ -7,6 +7,8 @@
   ``applied_transform`` has already been applied to poses and points alike, so nothing is left to do with it.
 * instant-ngp: as nerfstudio's, with ``aabb_scale``, ``scale`` and ``offset``, which only place the NeRF in its cube;
   often lists images that do not exist: those are named in a warning and skipped.
+* Satellite, of our own: as nerfstudio's, with ``camera_model`` AFFINE, focal lengths in pixels per world unit, and
+  ``shear``, ``metres_per_unit`` and ``sun`` of :class:`~minisplat_ref.types.Optics`.
 
 Poses are world_from_camera in OpenGL axes (x right, y up, z backward); flipping the y and z columns gives OpenCV axes,
 and the inverse gives cam_from_world. The world frame stays the file's. An alpha channel is composited onto the
@@ -17,7 +19,7 @@ per-frame exposure, rolling shutter.
 import math
 import reprlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ import numpy as np
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.images import PHOTOGRAPHS, PIXELS_MAX, image_size
 from minisplat_ref.io.json_file import as_array, as_number, read_json
-from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
+from minisplat_ref.io.lens import PARALLEL_MODEL, PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
 from minisplat_ref.io.names import is_file, nearby_path, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, load_points
 from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing, split_photos
@@ -213,6 +215,19 @@ def _photo(file: Path, frame: Mapping[str, Any], image_file: Path) -> Photo:
     return Photo(image_file.parent, image_file.name, mask_path, camera, lens, time=_time(file, frame))
 
 
+def _parallel_rays(
+    file: Path, frame: Mapping[str, Any], number: Callable[[str], float]
+) -> tuple[float, float, float, float, float]:
+    """Return the coefficients of affine optics of a frame; one without a sun has no shadows."""
+    metres, sun = number("metres_per_unit"), as_array(frame.get("sun", [0, 0, 0]), (3,))
+    if not 0 < metres < math.inf:
+        raise InputError(f"{file}: metres_per_unit of {frame['file_path']} is not above 0; make the scene again")
+    if sun is None or not (sun[2] > 0 or not sun.any()):
+        raise InputError(f"{file}: sun of {frame['file_path']} is no direction [3] upwards; make the scene again")
+    east, north, up = sun.tolist()
+    return number("shear"), metres, east, north, up
+
+
 def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Camera, Lens | None]:
     """Return camera and lens of a frame, in whichever dialect its focal length is given."""
 
@@ -256,6 +271,8 @@ def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Cam
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(frame.get("camera_model", "OPENCV")).upper().replace("-", "_")
     model = OTHER_MODELS.get(model, model)
+    if model == PARALLEL_MODEL:
+        return camera, Lens(model, (*pinhole, *_parallel_rays(file, frame, number)))
     if frame.get("is_fisheye") or model == "OPENCV_FISHEYE":
         return camera, Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4))
     if model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS) or k4 != 0.0:

@@ -101,4 +101,4 @@ def are_in_free_balls(primitives: Primitives, balls: FreeBalls, n_sigmas: float)
 
 def _has_ball(view: View) -> bool:
     optics = view.camera.optics
-    return view.point_ids is not None and len(view.point_ids) > 0 and (optics is None or optics.model != "orthographic")
+    return view.point_ids is not None and len(view.point_ids) > 0 and (optics is None or not optics.is_parallel)

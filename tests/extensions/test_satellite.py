@@ -24,7 +24,7 @@ from minisplat_ref.extensions.satellite.recipe import (
     shadow_entropy,
     stages,
 )
-from minisplat_ref.mechanisms.cameras.affine import orthographic, with_affine
+from minisplat_ref.mechanisms.cameras.affine import downward, orthographic, sun_slopes, with_affine
 from minisplat_ref.oracle.agreement import agreement_cases
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
@@ -37,6 +37,7 @@ from scenes import as_dtype
 from tolerances import PARITY_FLOAT64
 
 EXACT = 1e-12  # float64, a few operations
+NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0]])  # pixels per world unit
 FINE = 1e-8  # central differences of step 1e-5 on values near 1
 
 
@@ -229,7 +230,49 @@ def test_altitudes_have_to_be_a_range():
         with pytest.raises(InputError, match="no range"):
             cameras.check_altitudes(bad)
     with pytest.raises(InputError, match="horizon"):
-        cameras.make_affine_camera(np.eye(3), np.zeros(3), 4, 4, np.array([1.0, 0, 0]))
+        cameras.make_affine_camera(NORTH_UP, np.zeros(2), 1.0, (4, 4), np.array([1.0, 0, 0]))
+    with pytest.raises(InputError, match="mirrored"):
+        cameras.make_affine_camera(NORTH_UP * [-1, 1, 1], np.zeros(2), 1.0, (4, 4))
+
+
+def test_an_affine_map_becomes_a_camera():
+    """A sheared map of pixels that are not square comes back from rotation, focal lengths and shear; a unit is 48 m."""
+    A, b = np.array([[30.0, 2.0, -9.0], [1.5, -41.0, 6.0]]), np.array([20.0, 31.0])
+    camera = cameras.make_affine_camera(A, b, 48.0, (60, 40), np.array([2.0, -1.0, 4.0]))
+    R = camera.cam_from_world_R
+    assert np.abs(R @ R.T - np.eye(3)).max() < EXACT and np.linalg.det(R) == pytest.approx(1)
+    assert np.abs(A @ R[2]).max() < EXACT * 100 and R[2, 2] < 0  # rays go down, and a pixel sees one of them
+    assert camera.center == pytest.approx(-cameras.AWAY * R[2])
+    found = downward(camera)
+    assert_allclose(found.cam_from_world_R, [*A, [0, 0, -48]], atol=EXACT * 100)
+    assert_allclose(found.cam_from_world_t, [*b, 0], atol=EXACT * 100)
+    shift = found.cam_from_world_R[:2] @ sun_slopes(camera)  # a metre up, half a metre east, a quarter south
+    assert_allclose(shift, A @ [0.5 / 48, -0.25 / 48, 1 / 48], rtol=1e-12)
+    assert not sun_slopes(cameras.make_affine_camera(A, b, 48.0, (60, 40))).any()
+
+
+def test_convergence_by_hand():
+    """3 degrees east of a meridian at 60 N: atan(0.0524078 x 0.8660254) = 2.59867 degrees; west or south, minus it."""
+    assert cameras.grid_convergence(18.0, 60.0, 33) == pytest.approx(2.59867, abs=1e-5)
+    assert cameras.grid_convergence(12.0, 60.0, 33) == pytest.approx(-2.59867, abs=1e-5)
+    assert cameras.grid_convergence(18.0, -60.0, 33) == pytest.approx(-2.59867, abs=1e-5)
+
+
+@pytest.mark.parametrize(("longitude", "latitude"), [(17.8, 55.0), (12.2, 33.0), (17.0, -70.0)])
+def test_the_sun_in_the_north_is_where_utm_has_the_north(longitude, latitude):
+    """A sun due north is along the meridian's image, by differences of UTM; one due east at a right angle to it."""
+    places = cameras.utm_from_degrees(
+        np.full(2, longitude), latitude + np.array([-1e-4, 1e-4]), 33, is_south=latitude < 0
+    )
+    north = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
+    convergence = cameras.grid_convergence(longitude, latitude, 33)
+    assert_allclose(cameras.sun_direction(0, 0, convergence)[:2], north, atol=2e-5)  # 0.001 degrees
+    assert_allclose(cameras.sun_direction(90, 0, convergence)[:2], [north[1], -north[0]], atol=2e-5)
+
+
+def test_sun_by_hand():
+    assert_allclose(cameras.sun_direction(90, 45, 0), [0.5**0.5, 0, 0.5**0.5], atol=EXACT)
+    assert_allclose(cameras.sun_direction(32, 0, 2), [0.5, 0.75**0.5, 0], atol=EXACT)
 
 
 # --- light ---
@@ -265,9 +308,9 @@ def test_gradients(name):
             lambda v, *a: formulas.altitudes_vjp(*a, v),
         ),
         "shadows": (
-            (h, of_sun),
-            lambda a, b: formulas.shadows(a, b, (0.7, -0.4), (2, 2)).shadows,
-            lambda v, a, b: formulas.shadows_vjp(formulas.shadows(a, b, (0.7, -0.4), (2, 2)), v),
+            (h, of_sun, np.array([0.7, -0.4])),
+            lambda a, b, g: formulas.shadows(a, b, g, (2, 2)).shadows,
+            lambda v, a, b, g: formulas.shadows_vjp(formulas.shadows(a, b, g, (2, 2)), v),
         ),
         "light": (
             (rng.uniform(size=(4, 5, 3)), rng.uniform(size=(4, 5)), rng.normal(size=(3, 4)), rng.uniform(size=3)),
@@ -299,7 +342,7 @@ def test_slopes_at_the_kinks():
     at = shadow(3.0)
     right, left = (shadow(3.0 + d).shadows - at.shadows) / d, (at.shadows - shadow(3.0 - d).shadows) / d
     assert right[0, 0] == 0 and left[0, 0] == pytest.approx(formulas.DARKENING, rel=1e-5)
-    assert [float(v.sum()) for v in formulas.shadows_vjp(at, np.ones((1, 1)))] == [0, 0]
+    assert [float(v.sum()) for v in formulas.shadows_vjp(at, np.ones((1, 1)))] == [0, 0, 0]
     image, x, y = of_sun[..., None], np.full((1, 1), 1.5), np.full((1, 1), 0.5)
     read = formulas.sample(image, x, y)
     sides = [(formulas.sample(image, x + sign * d, y).values - read.values)[0, 0, 0] / (sign * d) for sign in (1, -1)]
@@ -342,8 +385,7 @@ def test_a_lone_gaussian_does_not_shade_itself(setting):
     """A tie, not a kink: h and h_s are equal but for rounding, s is 1, and what both get from it cancels."""
     g = type(setting.gaussians)(*(field[:1] for field in setting.gaussians))
     g = g._replace(means=np.array([[0.0, 0.0, 0.3]]), opacity_logits=np.array([4.0]))
-    camera = boxes.zenith(24)._replace(optics=Optics("affine", (0.31, -0.17)))
-    camera = camera._replace(cam_from_world_R=camera.cam_from_world_R * [[1.0], [1.0], [1 / boxes.SCALE]])
+    camera = boxes.zenith(24)._replace(optics=Optics("affine", (0.0, 1.0, 0.31 / 12, 0.17 / 12, 1.0)))  # 12 px a unit
     request = Request(backend=REFERENCE, wants=frozenset({"shadow"}))
     output, tape = SATELLITE.render(Model(g), view_from(camera), request)
     shadow = output.image[..., 3]
@@ -374,7 +416,7 @@ def test_a_roof_hides_the_sun():
         sh_rest=np.zeros((n, 0, 3)),
     )
     zenith = boxes.zenith(16)
-    camera = zenith._replace(optics=Optics("affine", (-4 / 10, 0.0)))  # 4 pixels for 10 m, from the west
+    camera = zenith._replace(optics=Optics("affine", (0.0, 48.0, -2.4, 0.0, 1.0)))  # 4 pixels for 10 m, from the west
     model = Model(g, {RADIOMETRY: np.tile(np.eye(3, 4), (2, 1, 1)), IN_SHADOW: np.array([[0.9] * 3, [0.2] * 3])})
     request = Request(backend=REFERENCE, wants=frozenset({"shadow", "albedo", "altitude"}))
     view = view_from(camera)._replace(view_id=1)
@@ -484,8 +526,9 @@ def test_limits_below_the_ground():
     for a, b in zip(plain.scene.train_views, low.scene.train_views, strict=True):
         assert np.array_equal(a.image, b.image)
         at = np.array([0.2, -0.3, 0.1])
-        seen = a.camera.cam_from_world_R @ at + a.camera.cam_from_world_t
-        moved = b.camera.cam_from_world_R @ np.add(at, [0, 0, 8 / boxes.SCALE]) + b.camera.cam_from_world_t
+        a, b = downward(a.camera), downward(b.camera)
+        seen = a.cam_from_world_R @ at + a.cam_from_world_t
+        moved = b.cam_from_world_R @ np.add(at, [0, 0, 8 / boxes.SCALE]) + b.cam_from_world_t
         assert np.abs(moved - seen - [0, 0, -8]).max() < EXACT * 100  # the depth is minus the altitude
 
 

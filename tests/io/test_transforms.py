@@ -382,3 +382,38 @@ def test_coefficients_are_in_the_order_of_colmap(tmp_path):
     fisheye = lens_of(tmp_path / "c", k1=0.1, k2=0.2, k3=0.3, k4=0.4, camera_model="opencv_fisheye")
     assert fisheye == ("OPENCV_FISHEYE", (*PINHOLE_OF_LENSES, 0.1, 0.2, 0.3, 0.4))
     assert lens_of(tmp_path / "d", camera_model="Pinhole") is None
+
+
+PARALLEL = {"camera_model": "AFFINE", "shear": 0.1, "metres_per_unit": 48.0}
+
+
+def test_parallel_rays(tmp_path):
+    """Shear, metres and the sun are those of affine optics; the extent is half the largest diagonal in world units."""
+    assert lens_of(tmp_path / "a", **PARALLEL) == ("AFFINE", (*PINHOLE_OF_LENSES, 0.1, 48.0, 0.0, 0.0, 0.0))
+    assert lens_of(tmp_path / "b", **PARALLEL, sun=[3, -4, 5])[1][4:] == (0.1, 48.0, 3.0, -4.0, 5.0)
+    write_transforms(tmp_path, **NERFSTUDIO, **PARALLEL, sun=[3, -4, 5])
+    for undistort in (False, True):
+        with pytest.raises(InputError, match=r"rays of 000\d\.png are parallel .*train with --recipe satellite"):
+            load_transforms(tmp_path, undistort=undistort)
+    scene = load_transforms(tmp_path, as_photographed=True)
+    cameras = [view.camera for view in scene.train_views]
+    assert all(camera.optics == ("affine", (0.1, 48.0, 3.0, -4.0, 5.0)) for camera in cameras)
+    assert scene.extent == max(np.hypot(c.width / c.fx, c.height / c.fy) for c in cameras) / 2
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"metres_per_unit": 0.0}, "metres_per_unit of .* is not above 0"),
+        ({"metres_per_unit": float("nan")}, "metres_per_unit of .* is not above 0"),
+        ({"sun": [1, 2, 0]}, "sun of .* is no direction"),
+        ({"sun": [1, 2]}, "sun of .* is no direction"),
+        ({"sun": [float("nan"), 0, 1]}, "coefficients that are not finite"),
+        ({"shear": float("inf")}, "coefficients that are not finite"),
+        ({"shear": "x"}, "shear of .* is 'x', not a number"),
+    ],
+)
+def test_bad_parallel_rays(tmp_path, entries, message):
+    write_transforms(tmp_path, **{**NERFSTUDIO, **PARALLEL, **entries})
+    with pytest.raises(InputError, match=message):
+        load_transforms(tmp_path, as_photographed=True)

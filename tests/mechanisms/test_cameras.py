@@ -8,7 +8,17 @@ from gradcheck import check_inner_products
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.lens import COEFFICIENTS, Lens, lens_optics
-from minisplat_ref.mechanisms.cameras.affine import AffineCamera, orthographic, project, project_vjp, with_affine
+from minisplat_ref.mechanisms.cameras import ray_footprints
+from minisplat_ref.mechanisms.cameras.affine import (
+    AffineCamera,
+    downward,
+    downward_vjp,
+    orthographic,
+    project,
+    project_vjp,
+    sun_slopes,
+    with_affine,
+)
 from minisplat_ref.mechanisms.cameras.distortion import brown_limit, fisheye_limit
 from minisplat_ref.mechanisms.cameras.models import (
     MODELS,
@@ -239,6 +249,49 @@ def test_the_affine_projection_is_exact_and_so_is_its_gradient(conventions):
     gradient = project_vjp(*p, camera, conventions, found, v)
     names = ("means", "quats", "scales", "opacities", "A", "b")
     check_inner_products(function, gradient, (*p, A, b), v, rng, names=names)
+
+
+def satellite_camera():
+    return turned_camera()._replace(fx=30.0, fy=20.0, optics=Optics("affine", (0.3, 48.0, 0.0, 0.0, 0.0)))
+
+
+def test_affine_optics_by_hand():
+    """v is sheared by 0.3 of x: of (1, 2, 5) it is 20 (2 + 0.3), and its ray has the direction of the axis."""
+    camera, x = satellite_camera(), np.array([[1.0, 2.0, 5.0]])
+    model, center = model_of(camera), np.array([camera.cx, camera.cy])
+    pixels = model.project(x, camera)
+    assert_allclose(pixels, [center + np.array([30, 20 * 2.3])], atol=1e-12)
+    assert_allclose(model.jacobians(x, camera), [[[30, 0, 0], [6, 20, 0]]], atol=1e-12)
+    origins, directions = model.rays(pixels, camera)
+    assert_allclose(origins + 5 * directions, x, atol=1e-12)
+    check_optics(camera)
+    with pytest.raises(InputError, match="train with --recipe satellite"):
+        ray_footprints.project(primitives(), camera, GSPLAT_MAIN)
+
+
+def test_downward_has_the_pixels_of_affine_optics_and_the_altitude():
+    """The altitude is that of the world, 48 m a unit, however the camera is turned and moved."""
+    camera, p = satellite_camera(), primitives()
+    found = downward(camera)
+    u = p.means @ found.cam_from_world_R.T + found.cam_from_world_t
+    x = p.means @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    assert_allclose(u[:, :2], model_of(camera).project(x, camera), atol=1e-12)
+    assert_allclose(u[:, 2], -48 * p.means[:, 2], atol=1e-12)
+    rng = np.random.default_rng(0)
+    v_A, v_b, d_R, d_t = (rng.normal(size=shape) for shape in ((3, 3), 3, (3, 3), 3))
+    v_R, v_t = downward_vjp(camera, v_A, v_b)
+    R, t = camera.cam_from_world_R, camera.cam_from_world_t
+    moved = downward(camera._replace(cam_from_world_R=R + d_R, cam_from_world_t=t + d_t))  # it is linear
+    change = np.sum(v_A * (moved[0] - found[0])) + v_b @ (moved[1] - found[1])
+    assert np.sum(v_R * d_R) + v_t @ d_t == pytest.approx(change, rel=1e-12)
+
+
+def test_the_sun_gains_a_metre():
+    """Towards (3, -4, 2), 48 m a unit: a metre up is 1.5 m and -2 m beside; without a sun nothing."""
+    camera = satellite_camera()
+    shining = camera._replace(optics=Optics("affine", (0.3, 48.0, 3.0, -4.0, 2.0)))
+    assert_allclose(sun_slopes(shining), np.array([1.5, -2, 1]) / 48, rtol=1e-14)
+    assert not sun_slopes(camera).any() and not sun_slopes(camera._replace(optics=None)).any()
 
 
 def test_orthographic_is_affine_and_draws_on_every_backend():

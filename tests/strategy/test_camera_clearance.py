@@ -72,7 +72,12 @@ def test_points_of_other_photographs_shrink_a_ball():
 
 @pytest.mark.parametrize(
     "view",
-    [view_at([0, 0, 0], None), view_at([0, 0, 0], np.zeros(0, int)), view_at([0, 0, 0], SOME, Optics("orthographic"))],
+    [
+        view_at([0, 0, 0], None),
+        view_at([0, 0, 0], np.zeros(0, int)),
+        view_at([0, 0, 0], SOME, Optics("orthographic")),
+        view_at([0, 0, 0], SOME, Optics("affine", (0.0, 1.0, 0.0, 0.0, 0.0))),
+    ],
 )
 def test_views_without_tracks_or_a_center_have_no_ball(view):
     assert find_free_balls([view], at_distances(1.0, 1.0, 1.0), 0.5).radii.shape == (0,)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.satellite.cameras import make_affine_camera
+from minisplat_ref.mechanisms.cameras.affine import downward
 from minisplat_ref.types import Bools, Camera, Floats, Frame, Scene, View
 
 SCALE, SIZE, N_VIEWS = 48.0, 96, 6  # metres per unit, pixels, photographs
@@ -46,10 +47,8 @@ def zenith(size: int = SIZE, width: float = 2 * SCALE) -> Camera:
 def _camera(tilt: Floats, size: int, width: float, sun: Floats | None) -> Camera:
     """Return a camera that sees what is h metres high beside by ``tilt h`` metres."""
     per_metre = size / width
-    A = SCALE * np.array(
-        [[per_metre, 0, -per_metre * tilt[0]], [0, -per_metre, per_metre * tilt[1]], [0, 0, 1.0]]
-    )  # fmt: skip
-    return make_affine_camera(A, np.array([size / 2, size / 2, 0]), size, size, sun)
+    A = SCALE * np.array([[per_metre, 0, -per_metre * tilt[0]], [0, -per_metre, per_metre * tilt[1]]])
+    return make_affine_camera(A, np.array([size / 2, size / 2]), SCALE, (size, size), sun)
 
 
 def make_boxes(rng: np.random.Generator) -> Boxes:
@@ -83,11 +82,12 @@ def meet(boxes: Boxes, origins: Floats, direction: Floats, limit: float) -> tupl
 
 def trace(boxes: Boxes, camera: Camera, sun: Floats | None) -> tuple[Floats, Floats, Bools]:
     """Return albedo [H, W, 3], height [H, W] and which pixels [H, W] are in shadow."""
-    A = camera.cam_from_world_R / SCALE  # per metre; rows of u, v, -h
+    seen = downward(camera)
+    A = seen.cam_from_world_R / SCALE  # per metre; rows of u, v, -h
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     top = HIGH + 1
     targets = np.stack([columns, rows, np.full(rows.shape, -top)], axis=-1).reshape(-1, 3)
-    origins = (targets - camera.cam_from_world_t) @ np.linalg.inv(A).T
+    origins = (targets - seen.cam_from_world_t) @ np.linalg.inv(A).T
     down = np.linalg.solve(A, [0.0, 0.0, 1.0])  # metres per metre downwards
     lengths, box, axis = meet(boxes, origins, down, top)
     points = origins + lengths[:, None] * down
@@ -131,7 +131,7 @@ def make_scene(seed: int, n_points: int = 5000, size: int = SIZE, below: float =
         light = np.column_stack([C, rng.uniform(-0.05, 0.05, 3)]) if k else np.eye(3, 4)
         lit = np.where(is_shadow[..., None], SKY, 1) * (albedo @ light[:, :3].T + light[:, 3])
         image = np.clip(np.rint(255 * lit), 0, 255).astype(np.uint8)
-        lowered = camera.cam_from_world_t - below / SCALE * camera.cam_from_world_R[:, 2] * [1, 1, 0]
+        lowered = camera.cam_from_world_t - below / SCALE * camera.cam_from_world_R[:, 2]
         views.append(View(f"{k:02d}", camera._replace(cam_from_world_t=lowered), image, None, view_id=k))
         masks.append(is_shadow)
         radiometry.append(light)

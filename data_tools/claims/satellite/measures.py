@@ -12,14 +12,14 @@ from data_tools.claims.kit.tables import spread, table
 from data_tools.claims.satellite.boxes import HIGH, SCALE, SIZE, Truth, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.satellite.cameras import fit_residual
-from minisplat_ref.extensions.satellite.commands import surface_model
 from minisplat_ref.extensions.satellite.model import RADIOMETRY, SATELLITE
+from minisplat_ref.extensions.satellite.surface import surface_model
 from minisplat_ref.interface.reporting import markdown_table
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import LogLinear
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.types import Floats, Model, Scene
+from minisplat_ref.types import Floats, Model, Scene, View
 
 ARMS = (
     "all",
@@ -59,9 +59,7 @@ class Measured(NamedTuple):
 def arm_of(arm: str, recipe: Recipe, scene: Scene) -> tuple[Recipe, Scene]:
     """Return what an arm trains with."""
     if arm == "without shadows":
-        views = [v._replace(camera=v.camera._replace(optics=v.camera.optics._replace(coefficients=())))  # type: ignore[union-attr]
-                 for v in scene.train_views]  # fmt: skip
-        return recipe, scene._replace(train_views=tuple(views))
+        return recipe, scene._replace(train_views=tuple(map(_without_sun, scene.train_views)))
     if arm == "without radiometry":
         still = recipe.representation._replace(rates=recipe.representation.rates.change(radiometry=0.0))
         return recipe._replace(representation=still), scene
@@ -74,6 +72,14 @@ def arm_of(arm: str, recipe: Recipe, scene: Scene) -> tuple[Recipe, Scene]:
         return recipe._replace(has_random_background=False), scene
     losses = tuple(term for term in recipe.losses if term.name != _TERMS.get(arm))
     return recipe._replace(losses=losses), scene
+
+
+def _without_sun(view: View) -> View:
+    """Return a photograph whose camera knows of no sun."""
+    optics = view.camera.optics
+    assert optics is not None
+    dark = optics._replace(coefficients=(*optics.coefficients[:2], 0.0, 0.0, 0.0))
+    return view._replace(camera=view.camera._replace(optics=dark))
 
 
 def measure(model: Model, truth: Truth) -> tuple[Measured, Floats]:

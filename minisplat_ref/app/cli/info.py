@@ -224,7 +224,9 @@ def _scene_rows(path: Path, model: str | None) -> Rows:
     from minisplat_ref.io.scene import build_reading, build_scene
 
     listing = list_scene(path, TEST_EVERY, model)
-    scene = build_scene(listing, build_reading(1, None, True, listing.alpha_is_mask))
+    photos = (*listing.train_photos, *listing.test_photos)
+    is_parallel = any(photo.lens is not None and photo.lens.is_parallel for photo in photos)
+    scene = build_scene(listing, build_reading(1, None, not is_parallel, listing.alpha_is_mask, is_parallel))
     place = describe_place(place_scene(scene))
     views = (*scene.train_views, *scene.test_views)
     focals = sorted(view.camera.fx for view in views)
@@ -234,7 +236,7 @@ def _scene_rows(path: Path, model: str | None) -> Rows:
         ("files", one_line(take_inventory(path, scene, model).line)),
         ("views", f"{len(views)}: {len(scene.train_views)} training, {len(scene.test_views)} test"),
         ("image sizes", describe_sizes([(view.camera.width, view.camera.height) for view in views])),
-        ("focal length", f"{focals[0]:.1f} to {focals[-1]:.1f} px"),
+        ("focal length", f"{focals[0]:.1f} to {focals[-1]:.1f} {'pixels per world unit' if is_parallel else 'px'}"),
         *([("masks", f"{n_masks} of {len(views)} views")] if n_masks else []),
         ("points", f"{len(scene.points):,}"),
         *_bounds_rows(scene.points),

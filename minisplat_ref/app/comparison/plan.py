@@ -162,9 +162,11 @@ def check(plan: Plan) -> Scene:
 
 
 def load_fold(plan: Plan, fold: int = 0) -> Scene:
-    """Load the scene as the trainings of a fold have it."""
+    """Load the scene as the trainings of a fold have it: as photographed if all recipes render lenses."""
     listing = list_scene(plan.scene, plan.test_every, offset=fold)
-    return place_scene(build_scene(listing, build_reading(plan.downscale, None, False, listing.alpha_is_mask)))
+    takes_optics = all(find_recipe(name).representation.takes_optics for name in plan.recipes)
+    reading = build_reading(plan.downscale, None, False, listing.alpha_is_mask, takes_optics)
+    return place_scene(build_scene(listing, reading))
 
 
 def _check_folds(scene: Path, folds: int) -> None:

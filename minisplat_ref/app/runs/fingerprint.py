@@ -98,7 +98,7 @@ def difference(entries: Entries, others: Entries) -> str:
         _count([name for name in ours if name not in theirs], "is missing", "are missing"),
         _count([name for name in theirs if name not in ours], "is new", "are new"),
         _count(resized, "has another size", "have another size"),
-        _count([name for name in alike if not _has_same(ours[name], theirs[name], CAMERA)], "has moved", "have moved"),
+        _count([name for name in alike if _has_moved(ours[name], theirs[name])], "has moved", "have moved"),
         _count(
             [
                 name
@@ -114,6 +114,13 @@ def difference(entries: Entries, others: Entries) -> str:
 
 SIZE = ("width", "height")
 CAMERA = ("position", "rotation", "fx", "fy", "cx", "cy", "time")
+OPTICS = "optics"  # the name of a lens and its coefficients, absent for a pinhole
+
+
+def _has_moved(entry: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    (name, *ours), (other_name, *theirs) = (camera.get(OPTICS) or ["pinhole"] for camera in (entry, other))
+    is_lens_alike = name == other_name and (ours == theirs or _has_same({OPTICS: ours}, {OPTICS: theirs}, (OPTICS,)))
+    return not (is_lens_alike and _has_same(entry, other, CAMERA))
 
 
 def _has_same(entry: Mapping[str, Any], other: Mapping[str, Any], keys: Sequence[str]) -> bool:

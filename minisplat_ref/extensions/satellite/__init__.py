@@ -14,7 +14,8 @@ albedo 0.1, where they differ by less than 0.3) and the entropy of shadows (0.01
 control but pruning, and no harmonics. At the end the radiometry of the first photograph goes into all colours. The
 surface model is the altitude that a camera in the zenith renders.
 
-    minisplat-ref satellite train IMAGES --altitudes 0,80 --out RUN
+    minisplat-ref satellite scene IMAGES --altitudes 0,80 --out SCENE
+    minisplat-ref train SCENE --recipe satellite --out RUN
     minisplat-ref satellite dsm RUN --out dsm.npy
     python -m data_tools.claims satellite/boxes --out DIR
     python -m data_tools.claims satellite/distance --out DIR
@@ -34,13 +35,13 @@ corrected (bundle adjustment); image positions have to be right already.
 """
 
 from minisplat_ref.extensions.extension import Extension
-from minisplat_ref.extensions.satellite import commands
+from minisplat_ref.extensions.satellite import scene, surface
 from minisplat_ref.extensions.satellite.recipe import RECIPE, SEEN_FROM_ABOVE, stages
 
 EXTENSION = Extension(
     "satellite",
     recipes=(RECIPE,),
     representation=SEEN_FROM_ABOVE,
-    commands=(commands,),
+    commands=(scene, surface),
     stages=stages,
 )

@@ -28,7 +28,8 @@ scene of 500 m diverge by 0.001 radians. From an aircraft they do not fit, which
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +47,8 @@ _POWERS = np.array(
 )  # fmt: skip
 N_NEWTON = 20  # steps at most; four are usual
 MAX_MISS = 1e-6  # pixels by which a localisation may miss
+
+RASTERS = (".tif", ".tiff", ".jp2", ".ntf", ".nitf")  # whose metadata may hold an RPC, and which rasterio reads
 
 _RPB_NAMES = {
     "lineOffset": "LINE_OFF",
@@ -76,7 +79,8 @@ _SERIES = (
 
 GRID = (31, 37, 29)  # samples, lines, altitudes
 MAX_RESIDUAL = 1.0  # pixels
-AFFINE = "affine"  # the name of these optics
+AWAY = 4.0  # world units from a camera to the origin
+MIN_ELEVATION = 1e-3  # radians of the sun above the horizon
 
 
 class RPC(NamedTuple):
@@ -172,19 +176,32 @@ def read_rpc(path: str | Path) -> RPC:
         beside = path.with_name(path.stem + end)
         if beside.exists():
             return parse_rpc(_read_text(beside), beside)
-    if path.suffix.lower() not in (".tif", ".tiff"):
+    if path.suffix.lower() not in RASTERS:
         raise InputError(f"{path}: no RPC; put {path.stem}_RPC.TXT beside it")
+    with open_raster(path) as file:
+        tags = file.tags(ns="RPC")
+    if not tags:
+        raise InputError(f"{path}: its metadata have no RPC; put {path.stem}_RPC.TXT beside it")
+    return _make_rpc({name: _floats(str(text)) for name, text in tags.items()}, path)
+
+
+@contextmanager
+def open_raster(path: Path) -> Iterator[Any]:
+    """Open an image by rasterio.
+
+    Raises
+    ------
+    InputError
+        It is damaged or in an unknown format, or rasterio is not installed.
+    """
     rasterio = import_rasterio(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # its RPC is its place
             with rasterio.open(path) as file:
-                tags = file.tags(ns="RPC")
-    except rasterio.errors.RasterioIOError as error:
-        raise InputError(f"{path}: no GeoTIFF, {one_line(str(error))}") from error
-    if not tags:
-        raise InputError(f"{path}: its metadata have no RPC; put {path.stem}_RPC.TXT beside it")
-    return _make_rpc({name: _floats(str(text)) for name, text in tags.items()}, path)
+                yield file
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"{path}: cannot be read, {one_line(str(error))}; export it again") from error
 
 
 def import_rasterio(path: Path) -> Any:
@@ -199,7 +216,8 @@ def import_rasterio(path: Path) -> Any:
         import rasterio
     except ImportError as error:
         raise InputError(
-            f"{path}: a GeoTIFF needs rasterio: pip install 'minisplat-ref[satellite]', or use texts and .npy"
+            f"{path}: GeoTIFF and 16 bits need rasterio: pip install 'minisplat-ref[satellite]', or use texts,"
+            " PNGs of 8 bits and .npy"
         ) from error
     return rasterio
 
@@ -256,6 +274,31 @@ def _read_text(path: Path) -> str:
         raise InputError(f"{path}: cannot be read, {error.strerror}") from error
 
 
+def grid_convergence(longitude: float, latitude: float, zone: int) -> float:
+    """Return how far the grid's north is to the right of true north, degrees: ``atan(tan(dl) sin(phi))``.
+
+    This is of a sphere, and off by less than 0.001 degrees within a zone.
+    """
+    dl, phi = np.radians(longitude - (6 * zone - 183)), np.radians(latitude)
+    return float(np.degrees(np.arctan(np.tan(dl) * np.sin(phi))))
+
+
+def sun_direction(azimuth: float, elevation: float, convergence: float) -> Floats:
+    """Return the unit vector [3] towards the sun by the axes of the grid: east, north, up.
+
+    Parameters
+    ----------
+    azimuth : float
+        Degrees clockwise from true north; by the grid it is less by the convergence.
+    elevation : float
+        Degrees above the horizon.
+    convergence : float
+        From :func:`grid_convergence`.
+    """
+    a, e = np.radians(azimuth - convergence), np.radians(elevation)
+    return np.array([np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)])
+
+
 def find_zone(longitude: float) -> int:
     """Return the zone, 1 to 60, of a longitude in degrees; the exceptions of Norway and Svalbard are left out."""
     return int((longitude + 180) // 6) % 60 + 1
@@ -301,6 +344,20 @@ class Frame(NamedTuple):
     zone: int
     """Of UTM."""
     is_south: bool
+    convergence: float = 0.0
+    """Degrees by which the grid's north is to the right of true north, in the middle."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what :meth:`from_json` reads."""
+        return {**self._asdict(), "origin": self.origin.tolist()}
+
+    @classmethod
+    def from_json(cls, entries: Any) -> "Frame":
+        """Return the frame of its entries; raise KeyError, TypeError or ValueError where they are not those."""
+        origin, scale = np.array(entries["origin"], np.float64), float(entries["scale"])
+        if origin.shape != (3,) or not np.isfinite(origin).all() or not 0 < scale < np.inf:
+            raise ValueError("the origin is not of three numbers, or the scale is not above 0")
+        return cls(origin, scale, int(entries["zone"]), bool(entries["is_south"]), float(entries["convergence"]))
 
 
 class Fit(NamedTuple):
@@ -392,7 +449,8 @@ def choose_frame(rpcs: list[RPC], size: tuple[int, int], altitudes: tuple[float,
     zone, is_south = find_zone(ground[0, 0]), bool(ground[0, 1] < 0)
     places = utm_from_degrees(ground[:, 0], ground[:, 1], zone, is_south=is_south)
     scale = float(np.linalg.norm(places[2] - places[1]) / 2)
-    return Frame(np.array([*places[0], altitudes[0]]), scale, zone, is_south)
+    convergence = grid_convergence(ground[0, 0], ground[0, 1], zone)
+    return Frame(np.array([*places[0], altitudes[0]]), scale, zone, is_south, convergence)
 
 
 def fit_rpc(rpc: RPC, frame: Frame, size: tuple[int, int], altitudes: tuple[float, float], name: str) -> Fit:
@@ -407,15 +465,24 @@ def fit_rpc(rpc: RPC, frame: Frame, size: tuple[int, int], altitudes: tuple[floa
     return fit_affine(world_of, *size, (low, high), name)
 
 
-def make_affine_camera(A: Floats, b: Floats, width: int, height: int, sun: Floats | None = None) -> Camera:
-    """Return a camera of the affine map to pixels and altitude; the depth that orders is the negative altitude.
+def make_affine_camera(A: Floats, b: Floats, scale: float, size: tuple[int, int], sun: Floats | None = None) -> Camera:
+    """Return the camera of an affine map to pixels, with a rotation for its pose, as all cameras have one.
+
+    With rows ``a_0`` and ``a_1`` of A, r of the rotation, and a shear s::
+
+        f_x r_0 = a_0,   f_y (r_1 + s r_0) = a_1,   r_2 = r_0 x r_1, down
+
+    The rays do not say how far away the camera is: it is :data:`AWAY` from the origin.
 
     Parameters
     ----------
-    A : ndarray of shape (3, 3)
-        Pixels, pixels and altitude per world unit.
-    b : ndarray of shape (3,)
-    width, height : int
+    A : ndarray of shape (2, 3)
+        Pixels per world unit.
+    b : ndarray of shape (2,)
+        Pixels.
+    scale : float
+        Metres per world unit; the world's z is up.
+    size : (width, height)
         Image, pixels.
     sun : ndarray of shape (3,), optional
         World direction towards the sun, of any length; without one there are no shadows.
@@ -423,13 +490,17 @@ def make_affine_camera(A: Floats, b: Floats, width: int, height: int, sun: Float
     Raises
     ------
     InputError
-        The sun does not shine from above.
+        The image is mirrored, or the sun does not shine from above.
     """
-    down = np.array([1.0, 1.0, -1.0])
-    slopes: tuple[float, ...] = ()
-    if sun is not None:
-        g = A @ np.asarray(sun, np.float64)
-        if not g[2] > 1e-3 * np.abs(A[2]).max() * np.linalg.norm(sun):
-            raise InputError("the sun is at the horizon or below: give a direction towards it, upwards")
-        slopes = float(g[0] / g[2]), float(g[1] / g[2])
-    return Camera(down[:, None] * A, down * b, 1.0, 1.0, 0.0, 0.0, width, height, Optics(AFFINE, slopes))
+    fx = float(np.linalg.norm(A[0]))
+    r0 = A[0] / fx
+    across = A[1] - (A[1] @ r0) * r0
+    fy = float(np.linalg.norm(across))
+    R = np.stack([r0, across / fy, np.cross(r0, across / fy)])
+    if not R[2, 2] < 0:  # True for NaN
+        raise InputError("an image is mirrored, or not seen from above: flip it, together with its RPC")
+    direction = np.zeros(3) if sun is None else np.asarray(sun, np.float64)
+    if sun is not None and not direction[2] > MIN_ELEVATION * np.linalg.norm(direction):
+        raise InputError("the sun is at the horizon or below: give a direction towards it, upwards")
+    optics = Optics("affine", (float(A[1] @ r0) / fy, float(scale), *direction.tolist()))
+    return Camera(R, np.array([0.0, 0.0, AWAY]), fx, fy, float(b[0]), float(b[1]), *size, optics)

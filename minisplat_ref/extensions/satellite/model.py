@@ -1,8 +1,9 @@
 """The renderer of satellite photographs: splatting by an affine camera, the sun's shadow map, and radiometry (EOGS).
 
 A pixel (u, v) whose rendered altitude is h lies in the sun's image at ``(u, v) - g h``: g is the shift, in pixels per
-unit of altitude, along the sun's rays: the paper's ``M = [[1, 0, -g_u], [0, 1, -g_v], [0, 0, 1]]``. There the
-sun sees altitude h_s. Higher than h, something is between::
+unit of altitude, along the sun's rays: the paper's ``M = [[1, 0, -g_u], [0, 1, -g_v], [0, 0, 1]]``. It is ``A_xy d``,
+d the world direction towards the sun that gains a metre. There the sun sees altitude h_s. Higher than h, something is
+between::
 
     s = exp(0.4 min(h - h_s, 0))
     I = (s + (1 - s) k) (C a + c)
@@ -10,9 +11,8 @@ sun sees altitude h_s. Higher than h, something is between::
 a is the albedo that splatting renders, C [3, 3] and c [3] the radiometry of the photograph, and k [3] the light of the
 sky in the shadow.
 
-A camera with ``affine`` optics has A for its rotation and b for its translation, and the sun's shift in its
-coefficients. One without optics, or ``orthographic``, has parallel rays, and its focal lengths are pixels per world
-unit.
+A camera with ``affine`` optics knows its metres and the sun. One without optics, or ``orthographic``, has parallel
+rays, too, and focal lengths in pixels per world unit; its depth counts as the negative altitude, and there is no sun.
 """
 
 from typing import Any, NamedTuple
@@ -21,8 +21,14 @@ import numpy as np
 
 from minisplat_ref.constants import SH_C0, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.satellite.cameras import AFFINE
-from minisplat_ref.mechanisms.cameras.affine import AffineCamera, orthographic, with_affine
+from minisplat_ref.mechanisms.cameras.affine import (
+    AffineCamera,
+    downward,
+    downward_vjp,
+    orthographic,
+    sun_slopes,
+    with_affine,
+)
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, activate, parameters_vjp
 from minisplat_ref.rendering.splatting import SplatGradient, SplatTape, splat, splat_vjp
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
@@ -117,11 +123,20 @@ class ShadowTape(NamedTuple):
     shadows: Floats  # [H, W] s
     is_shaded: Bools  # [H, W] whether h < h_s
     sampled: Sample
-    shift: tuple[float, float]
+    shift: Floats  # [2]
     shape: tuple[int, ...]  # of the sun's image
+    altitude: Floats  # [H, W] h
 
 
-def shadows(altitude: Floats, of_sun: Floats, shift: tuple[float, float], margin: tuple[int, int]) -> ShadowTape:
+class ShadowGradient(NamedTuple):
+    """Gradient of :func:`shadows`."""
+
+    altitude: Floats  # [H, W]
+    of_sun: Floats  # [H', W']
+    shift: Floats  # [2]
+
+
+def shadows(altitude: Floats, of_sun: Floats, shift: Floats, margin: tuple[int, int]) -> ShadowTape:
     """Return s of each pixel.
 
     Parameters
@@ -130,8 +145,8 @@ def shadows(altitude: Floats, of_sun: Floats, shift: tuple[float, float], margin
         h.
     of_sun : ndarray of shape (H', W')
         h_s, in the sun's image.
-    shift : (g_u, g_v)
-        Pixels per unit of altitude.
+    shift : ndarray of shape (2,)
+        g, pixels per unit of altitude.
     margin : (m_u, m_v)
         By how many pixels the sun's image is larger at each side.
     """
@@ -142,19 +157,20 @@ def shadows(altitude: Floats, of_sun: Floats, shift: tuple[float, float], margin
     sampled = sample(of_sun[..., None], x, y)
     below = altitude - sampled.values[..., 0]
     s = np.exp(DARKENING * np.minimum(below, 0)).astype(dtype)
-    return ShadowTape(s, below < 0, sampled, shift, (*of_sun.shape, 1))
+    return ShadowTape(s, below < 0, sampled, shift, (*of_sun.shape, 1), altitude)
 
 
-def shadows_vjp(tape: ShadowTape, v_shadows: Floats) -> tuple[Floats, Floats]:
-    """Gradient of :func:`shadows` with respect to h and h_s.
+def shadows_vjp(tape: ShadowTape, v_shadows: Floats) -> ShadowGradient:
+    """Gradient of :func:`shadows`.
 
     With ``v = 0.4 s v_s`` where ``h < h_s``, and ``p = (u, v) - g h``::
 
-        v_hs = -v at the corners of p,   v_h = v + g . v dh_s/dp
+        v_hs = -v at the corners of p,   v_h = v + g . v dh_s/dp,   v_g = sum h v dh_s/dp
     """
     v = np.where(tape.is_shaded, DARKENING * tape.shadows * v_shadows, 0).astype(v_shadows.dtype)
     v_of_sun, v_places = sample_vjp(tape.sampled, tape.shape, -v[..., None])
-    return v - tape.shift[0] * v_places[0] - tape.shift[1] * v_places[1], v_of_sun[..., 0]
+    v_altitude = v - (tape.shift[0] * v_places[0] + tape.shift[1] * v_places[1]).astype(v.dtype)
+    return ShadowGradient(v_altitude, v_of_sun[..., 0], -np.sum(tape.altitude * v_places, axis=(1, 2)))
 
 
 class LightGradient(NamedTuple):
@@ -212,18 +228,20 @@ def choose_affine(camera: Camera, conventions: Conventions) -> AffineCamera:
     """
     if camera.optics is None or camera.optics.model == "orthographic":
         return orthographic(camera, conventions)
-    if camera.optics.model != AFFINE:
+    if camera.optics.model != "affine":
         raise InputError(f"satellite draws affine cameras, not {camera.optics.model} ones: train with --recipe lens")
-    return AffineCamera(camera.cam_from_world_R, camera.cam_from_world_t, camera.width, camera.height)
+    return downward(camera)
 
 
-def sun_shift(camera: Camera) -> tuple[float, float]:
-    """Return the pixels by which the sun shifts a unit of altitude; zeros where there is no sun, or in the zenith."""
-    coefficients = () if camera.optics is None else camera.optics.coefficients
-    return (coefficients[0], coefficients[1]) if len(coefficients) == 2 else (0.0, 0.0)
+def choose_affine_vjp(camera: Camera, v_A: Floats, v_b: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`choose_affine` with respect to the pose."""
+    if camera.optics is not None and camera.optics.model == "affine":
+        return downward_vjp(camera, v_A, v_b)
+    per_unit = np.array([camera.fx, camera.fy, 1.0])
+    return per_unit[:, None] * v_A, per_unit * v_b
 
 
-def sheared(camera: AffineCamera, shift: tuple[float, float], margin: tuple[int, int]) -> AffineCamera:
+def sheared(camera: AffineCamera, shift: Floats, margin: tuple[int, int]) -> AffineCamera:
     """Return M A and M b, larger by a margin: a point of altitude h moves by ``-g h``. The third row is ``-h``."""
     A, b = (np.asarray(field, np.float64) for field in camera[:2])
     M = np.eye(3)
@@ -244,6 +262,7 @@ class Tape(NamedTuple):
     is_counted: bool  # whether there are any
     camera: Camera
     seen: SplatTape
+    affine: AffineCamera
     of_sun: SplatTape | None
     shadow: ShadowTape | None
     shadow_map: Floats  # [H, W] s
@@ -323,9 +342,10 @@ def render_photograph(model: Model, view: View, request: Request) -> tuple[Rende
     seen = splat_view(model, camera, request)
     sums, alpha = depth_sums(seen)
     h = altitudes(sums, alpha)
-    shift, of_sun, shadow = sun_shift(view.camera), None, None
+    of_sun = shadow = None
+    shift = camera.cam_from_world_R[:2] @ sun_slopes(view.camera)
     s = np.ones_like(alpha)
-    if shift != (0.0, 0.0) and model.shared.get(HAS_SHADOWS, (1.0,))[0] > 0:
+    if shift.any() and model.shared.get(HAS_SHADOWS, (1.0,))[0] > 0:
         margin = camera.width // 2, camera.height // 2
         of_sun = splat_view(model, sheared(camera, shift, margin), request, has_color=False)
         shadow = shadows(h, altitudes(*depth_sums(of_sun)), shift, margin)
@@ -342,7 +362,7 @@ def render_photograph(model: Model, view: View, request: Request) -> tuple[Rende
     n_pairs = len(seen.bins.gaussian_ids) + (0 if of_sun is None else len(of_sun.bins.gaussian_ids))
     output = seen.output._replace(image=image, visible_ids=visible_ids, n_pairs=n_pairs)
     tape = Tape(
-        model, row, is_counted, view.camera, seen, of_sun, shadow, s, radiometry, in_shadow, request.wants
+        model, row, is_counted, view.camera, seen, camera, of_sun, shadow, s, radiometry, in_shadow, request.wants
     )  # fmt: skip
     return output, tape
 
@@ -351,7 +371,8 @@ def render_photograph_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = 
     """Gradient of :func:`render_photograph`: light, then shadows, then the two splattings.
 
     Altitudes have gradients from their channel, from the shadows as receivers and, in the sun's image, as casters. Both
-    splattings add to the population and, through ``M A``, to the pose: ``v_A += M^T v_MA``.
+    splattings add to the population and, through ``M A``, to the pose: ``v_A += M^T v_MA``. The shift depends on A,
+    too: ``v_g = v_g of the shadows + v_MA A_z``, ``v_A_xy += v_g d^T``.
     """
     where = channels(tape.wants)
     v = {name: np.ascontiguousarray(v_image[..., part]) for name, part in where.items()}
@@ -361,25 +382,24 @@ def render_photograph_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = 
     of_light = light_vjp(albedo, tape.shadow_map, tape.radiometry, tape.in_shadow, v["rgb"])
     v_h = v["altitude"][..., 0] if "altitude" in v else np.zeros_like(alpha)
     v_albedo = of_light.albedo + (v["albedo"] if "albedo" in v else 0)
-    sun = None
+    sun = of_shadow = None
     if tape.shadow is not None and tape.of_sun is not None:
-        v_s = of_light.shadows + (v["shadow"][..., 0] if "shadow" in v else 0)
-        v_shaded, v_of_sun = shadows_vjp(tape.shadow, v_s)
-        v_h = v_h + v_shaded
-        sun = _splat_vjp(tape.model, tape.of_sun, altitudes_vjp(*depth_sums(tape.of_sun), v_of_sun), None)
+        of_shadow = shadows_vjp(tape.shadow, of_light.shadows + (v["shadow"][..., 0] if "shadow" in v else 0))
+        v_h = v_h + of_shadow.altitude
+        sun = _splat_vjp(tape.model, tape.of_sun, altitudes_vjp(*depth_sums(tape.of_sun), of_shadow.of_sun), None)
     of_h = altitudes_vjp(sums, alpha, v_h)
     of_h = AltitudeGradient(of_h.sums + (v["depth"][..., 0] if "depth" in v else 0), of_h.alpha + v_alpha)
     gaussians, of_splats = _splat_vjp(tape.model, tape.seen, of_h, v_albedo)
     v_A, v_b = of_splats.primitives.cam_from_world_R, of_splats.primitives.cam_from_world_t
-    if sun is not None:
+    if tape.shadow is not None and sun is not None and of_shadow is not None:
         gaussians = type(gaussians)(*(a + b for a, b in zip(gaussians, sun[0], strict=True)))
+        v_MA, v_Mb = sun[1].primitives.cam_from_world_R, sun[1].primitives.cam_from_world_t
         M = np.eye(3)
-        M[:2, 2] = sun_shift(tape.camera)
-        v_A = v_A + M.T @ sun[1].primitives.cam_from_world_R
-        v_b = v_b + M.T @ sun[1].primitives.cam_from_world_t
-    if tape.camera.optics is None or tape.camera.optics.model != AFFINE:
-        per_unit = np.array([tape.camera.fx, tape.camera.fy, 1.0])
-        v_A, v_b = per_unit[:, None] * v_A, per_unit * v_b
+        M[:2, 2] = tape.shadow.shift
+        v_A, v_b = v_A + M.T @ v_MA, v_b + M.T @ v_Mb
+        v_g = of_shadow.shift + v_MA[:2] @ tape.affine.cam_from_world_R[2] + v_Mb[:2] * tape.affine.cam_from_world_t[2]
+        v_A = v_A + np.outer([*v_g, 0], sun_slopes(tape.camera))
+    v_R, v_t = choose_affine_vjp(tape.camera, v_A, v_b)
     shared = {}
     if tape.is_counted:
         shared = {name: np.zeros_like(tape.model.shared[name]) for name in (RADIOMETRY, IN_SHADOW)}
@@ -387,7 +407,7 @@ def render_photograph_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = 
     if HAS_SHADOWS in tape.model.shared:
         shared[HAS_SHADOWS] = np.zeros_like(tape.model.shared[HAS_SHADOWS])
     return RenderGradient(
-        gaussians, of_splats.background, v_A.astype(alpha.dtype), v_b.astype(alpha.dtype), of_splats.means2d, shared
+        gaussians, of_splats.background, v_R.astype(alpha.dtype), v_t.astype(alpha.dtype), of_splats.means2d, shared
     )
 
 

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.satellite.cameras import AFFINE
 from minisplat_ref.extensions.satellite.model import (
     CHANNELS,
     HAS_SHADOWS,
@@ -39,7 +38,7 @@ from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState
-from minisplat_ref.types import Camera, Floats, Gaussians, Optics, Scene
+from minisplat_ref.types import Floats, Gaussians, Optics, Scene
 
 FLOOR = 0.05  # of a shadow and of its complement inside the logarithms of the entropy, as released
 SHADOWS_FROM = 1_000  # of 5,000 iterations; views are compared from then on, too
@@ -47,6 +46,7 @@ ITERATIONS = 5_000
 START_OPACITY, START_SIZE = 0.005, 0.5  # of points in the volume; size relative to the distance of neighbours
 SKY_LIGHT = 0.05  # k at the start
 ALL = frozenset(CHANNELS)
+SUN = -1.0, 1.0, 1.0  # of the checked stage
 TIE = 1e-12
 """Of a shadow or a slope, in float64: a thousand roundings of values near 1."""
 
@@ -74,7 +74,7 @@ def shadow_entropy(rendered: Rendered) -> tuple[float, Cotangents]:
     return float(np.mean(entropy, dtype=np.float64)), Cotangents({"shadow": slope})
 
 
-def make_shear(rendered: Rendered, noise: float) -> tuple[float, float]:
+def make_shear(rendered: Rendered, noise: float) -> Floats:
     """Return a random shear of the view in pixels per metre of altitude, the same whenever the iteration is done.
 
     ``M' = I + noise`` of the paper is in coordinates of -1 to 1 across the image, and in metres along the altitude; no
@@ -83,7 +83,7 @@ def make_shear(rendered: Rendered, noise: float) -> tuple[float, float]:
     camera = choose_affine(rendered.view.camera, rendered.request.conventions)
     drawn = np.random.default_rng([rendered.step, max(rendered.view.view_id, 0)]).normal(size=2)
     x, y = noise * np.clip(drawn, -1, 1)
-    return float(x * camera.width / 2), float(y * camera.height / 2)
+    return np.array([x * camera.width / 2, y * camera.height / 2])
 
 
 def view_consistency(
@@ -231,30 +231,37 @@ RECIPE = GS._replace(
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer with the sun: by an orthographic camera, instead of that without, and by an affine one.
+    """Return the renderer: by an orthographic camera, instead of that without, and by an affine one with the sun.
 
-    The affine camera, as those of satellites, has depths of both signs.
+    The affine camera, as those of satellites, has depths of both signs: the Gaussians are moved about altitude 0.
     """
-    per_unit = np.array([setting.camera.fx, setting.camera.fy, 1.0]) / 3  # the Gaussians lie at depth 3
-    shift = 1.3, -0.9
-    A = per_unit[:, None] * (setting.camera.cam_from_world_R + 0.02 * rng.normal(size=(3, 3)))
-    b = per_unit * setting.camera.cam_from_world_t + [setting.camera.width / 2, setting.camera.height / 2, -1]
-    flat = setting.camera._replace(fx=per_unit[0], fy=per_unit[1], optics=Optics("orthographic", shift))
-    affine = Camera(A, b, 1.0, 1.0, 0.0, 0.0, flat.width, flat.height, Optics(AFFINE, shift))
+    fx, fy = setting.camera.fx / 3, setting.camera.fy / 3  # the Gaussians lie at depth 3
+    flat = setting.camera._replace(fx=fx, fy=fy, optics=Optics("orthographic"))
+    affine = flat._replace(optics=Optics("affine", (0.1, 4.0, *SUN)))
+    means = setting.gaussians.means - np.median(setting.gaussians.means, axis=0) * [0, 0, 1]
+    around = setting._replace(gaussians=setting.gaussians._replace(means=means.astype(setting.gaussians.means.dtype)))
     name = SEEN_FROM_ABOVE.name
-    return _stage(backend, setting, flat, name, rng), _stage(backend, setting, affine, f"{name}, {AFFINE}", rng)
+    dark = _stage(backend, setting._replace(camera=flat), name, rng, (IN_SHADOW,))
+    return dark, _stage(backend, around._replace(camera=affine), f"{name}, affine", rng)
 
 
-def _stage(backend: Backend, setting: Setting, camera: Camera, name: str, rng: np.random.Generator) -> Stage:
-    named = SEEN_FROM_ABOVE._replace(name=name)
-    seen = setting._replace(camera=camera)
-    return model_stage(backend, seen, named, rng, wants=ALL, sides_of=_sides, fixed=("sh_rest",))  # which is empty
+def _stage(
+    backend: Backend, setting: Setting, name: str, rng: np.random.Generator, fixed: tuple[str, ...] = ()
+) -> Stage:
+    named = SEEN_FROM_ABOVE._replace(name=name, shared=_with_shadows)
+    still = ("sh_rest", *fixed)  # the first is empty
+    return model_stage(backend, setting, named, rng, wants=ALL, sides_of=_sides, fixed=still)
+
+
+def _with_shadows(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
+    return {**first_light(scene, rng), HAS_SHADOWS: np.ones(1, np.float32)}
 
 
 def _sides(drawn: Drawn) -> list[np.ndarray]:
     tape: Tape = drawn.tape
-    assert tape.of_sun is not None and tape.shadow is not None
-    faint = [part.output.alpha > MIN_ALPHA for part in (tape.seen, tape.of_sun)]
+    sides = [tape.seen.output.alpha > MIN_ALPHA, SH_C0 * drawn.model.gaussians.sh_dc + 0.5 > 0]
+    if tape.of_sun is None or tape.shadow is None:
+        return sides
     inside = np.abs(tape.shadow.sampled.slopes) > TIE
-    is_shaded, is_lit = tape.shadow.shadows < 1 - TIE, SH_C0 * drawn.model.gaussians.sh_dc + 0.5 > 0
-    return [*faint, is_shaded, tape.shadow.sampled.corners, inside, is_lit]
+    is_shaded = tape.shadow.shadows < 1 - TIE
+    return [*sides, tape.of_sun.output.alpha > MIN_ALPHA, is_shaded, tape.shadow.sampled.corners, inside]

@@ -18,6 +18,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.cameras.models import pixels_per_unit
 from minisplat_ref.reference.antialiasing import adjugates, compensations, compensations_vjp, determinants
 from minisplat_ref.reference.covariance import covariances, covariances_vjp
 from minisplat_ref.reference.extent import extents
@@ -68,6 +69,35 @@ def orthographic(camera: Camera, conventions: Conventions) -> AffineCamera:
         conventions.near_plane,
         conventions.far_plane,
     )
+
+
+def downward(camera: Camera) -> AffineCamera:
+    """Return the map of a camera with ``affine`` optics: to pixels, and to the negative altitude in metres.
+
+    With rows r of R, ``A = [fx r0, fy (r1 + s r0), -m e_z]`` and ``b = [fx t0 + cx, fy (t1 + s t0) + cy, 0]``.
+    """
+    L = pixels_per_unit(camera)
+    A = np.concatenate([L @ camera.cam_from_world_R[:2], [[0.0, 0.0, -metres_per_unit(camera)]]])
+    b = np.append(L @ camera.cam_from_world_t[:2] + [camera.cx, camera.cy], 0.0)
+    return AffineCamera(A, b, camera.width, camera.height)
+
+
+def downward_vjp(camera: Camera, v_A: Floats, v_b: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`downward` with respect to the pose: ``v_R = L^T v_A`` of the pixels; the rest is constant."""
+    L = pixels_per_unit(camera)
+    return np.concatenate([L.T @ v_A[:2], np.zeros((1, 3))]), np.append(L.T @ v_b[:2], 0.0)
+
+
+def metres_per_unit(camera: Camera) -> float:
+    """Return m of a camera with ``affine`` optics."""
+    assert camera.optics is not None and camera.optics.model == "affine"
+    return camera.optics.coefficients[1]
+
+
+def sun_slopes(camera: Camera) -> Floats:
+    """Return the direction [3] towards the sun per metre of altitude, world units; zeros where there is no sun."""
+    sun = np.array(() if camera.optics is None else camera.optics.coefficients[2:5])
+    return sun / (metres_per_unit(camera) * sun[2]) if sun.any() else np.zeros(3)
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported

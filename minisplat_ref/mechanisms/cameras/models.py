@@ -126,6 +126,28 @@ def _orthographic_rays(pixels: Floats, camera: Camera) -> tuple[Floats, Floats]:
     return origins, np.broadcast_to([0.0, 0.0, 1.0], origins.shape)
 
 
+def pixels_per_unit(camera: Camera) -> Floats:
+    """Return the derivatives [2, 2] of the pixels of ``affine`` optics with respect to the camera's x and y."""
+    shear = _coefficients(camera)[0]
+    return np.array([[camera.fx, 0.0], [camera.fy * shear, camera.fy]])
+
+
+def _project_affine(x: Floats, camera: Camera) -> Floats:
+    return x[:, :2] @ pixels_per_unit(camera).T + _center(camera)
+
+
+def _affine_jacobians(x: Floats, camera: Camera) -> Floats:
+    J = np.zeros((len(x), 2, 3))
+    J[:, :, :2] = pixels_per_unit(camera)
+    return J
+
+
+def _affine_rays(pixels: Floats, camera: Camera) -> tuple[Floats, Floats]:
+    places = (pixels - _center(camera)) @ np.linalg.inv(pixels_per_unit(camera)).T
+    origins = np.column_stack([places, np.zeros(len(pixels))])
+    return origins, np.broadcast_to([0.0, 0.0, 1.0], origins.shape)
+
+
 PERSPECTIVE = CameraModel(
     _project_perspective,
     _perspective_jacobians,
@@ -143,10 +165,13 @@ ORTHOGRAPHIC = CameraModel(
     z_depths_vjp,
 )
 """Focal lengths are pixels per world unit."""
+AFFINE = ORTHOGRAPHIC._replace(project=_project_affine, jacobians=_affine_jacobians, rays=_affine_rays)
+"""Likewise, with a shear; the order by altitude of :mod:`.affine` is not that of its depths, the camera z."""
 MODELS = {
     "brown": _make_lens_model(BROWN, z_depths, z_depths_vjp),
     "fisheye": _make_lens_model(FISHEYE, distances, distances_vjp),
     "orthographic": ORTHOGRAPHIC,
+    "affine": AFFINE,
 }
 """By :attr:`Optics.model`; a camera without optics is ``PERSPECTIVE``."""
 

@@ -144,8 +144,8 @@ def check_camera(camera: Camera, conventions: Conventions) -> None:
     """
     if conventions.is_antialiased:
         raise InputError("rays through lenses have no compensated opacities: leave the antialiased profile out")
-    if camera.optics is not None and camera.optics.model == "orthographic":
-        raise InputError("parallel rays are drawn exactly by the affine camera: take mechanisms.cameras.affine")
+    if camera.optics is not None and camera.optics.is_parallel:
+        raise InputError("parallel rays do not meet in a lens: train with --recipe satellite, which has affine cameras")
 
 
 def are_reached(x: Floats, scales: Floats, ratios: Floats, rays: Floats) -> Bools:

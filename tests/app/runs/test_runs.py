@@ -107,6 +107,10 @@ def test_a_changed_pixel_is_another_scene_for_eval_and_resume(done, scene, refus
         (lambda entries: entries[1].update(position=[9.0, 9, 9]), "1 view (b) has moved"),
         (lambda entries: entries[1].update(fx=9.5), "1 view (b) has moved"),
         (lambda entries: entries[1].update(time=0.5), "1 view (b) has moved"),
+        (lambda entries: entries[1].update(optics=["brown", 0.2]), "1 view (b) has moved"),
+        (lambda entries: entries[3].update(optics=["brown", 0.3]), "1 view (d) has moved"),
+        (lambda entries: entries[3].update(optics=["fisheye", 0.2]), "1 view (d) has moved"),
+        (lambda entries: entries[3].pop("optics"), "1 view (d) has moved"),
         (lambda entries: entries[0].update(width=9), "1 view (a) has another size"),
         (lambda entries: entries[2].update(photograph="0"), "1 view (c) has another photograph"),
         (lambda entries: entries.pop(), "1 view (e) is missing"),
@@ -127,12 +131,14 @@ def test_what_differs_is_said(change, expected):
             "rotation": np.eye(3).tolist(),
             **dict.fromkeys(("fx", "fy", "cx", "cy", "time"), 0.25),
             "photograph": name,
+            **({"optics": ["brown", 0.2]} if name == "d" else {}),
         }
         for name in "abcde"
     ]
     others = json.loads(json.dumps(entries))
     assert fingerprint.difference(entries, others) == ""
     others[0]["position"][0] += 1e-12  # another machine's rounding
+    others[3]["optics"][1] += 1e-12
     assert fingerprint.difference(entries, others) == ""
     change(others)
     assert fingerprint.difference(entries, others).startswith(expected)
