@@ -1,0 +1,165 @@
+"""Our figures beside those that others have published for the same scene, a row at a time.
+
+``python -m data_tools.published_scenes ROW --data DIR --out RUN`` trains as the row says, measures, and prints the row
+with the published figure, its source, and the machine; without ROW it lists the rows. DIR is what ``minisplat-ref data
+SET`` fetches. A run in RUN that has ended is not trained again. ``docs/measured/published.md`` has what was found.
+
+Published figures differ in more than the method, so each row says under which rules it was measured. On Lego, the
+images are composited onto white, there are no points, and random ones in a cube are the start
+(:mod:`minisplat_ref.io.transforms`); PSNR is the mean over images.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from minisplat_ref.app.cli import main as minisplat_ref
+from minisplat_ref.errors import InputError
+from minisplat_ref.interface.reporting import describe_machine, markdown_table
+from minisplat_ref.io.transforms import BLENDER_FILES
+
+SPARSE_VIEWS = (26, 86, 2, 55, 75, 93, 16, 73)  # eight of Lego's training images, as the papers on few views take them
+TEST_EVERY = 8  # of their test images
+WHITE = ("--background", "255,255,255")
+
+
+class Row(NamedTuple):
+    """A published figure, and the training that is compared with it."""
+
+    data_set: str
+    """Of ``minisplat-ref data``."""
+    options: tuple[str, ...]
+    """Of ``minisplat-ref train``."""
+    published: float | None
+    """PSNR, dB; None where nobody has published one."""
+    source: str
+    is_sparse: bool = False
+    """Eight training images, and every eighth test image."""
+
+
+FULL = "Kerbl et al. 2023, arXiv 2308.04079, table of the synthetic scenes"
+EIGHT = "issue 40 of Fictionarry/DNGaussian, by a user: 6,000 iterations, points sampled on the mesh, 200 test images"
+
+
+def _rows() -> dict[str, Row]:
+    rows = {}
+    for recipe, published, source in (
+        ("3dgs", 35.78, FULL),
+        ("3dgs-accel", 35.78, FULL),
+        ("mini-splatting2", None, ""),
+        ("adaptive", None, ""),
+    ):
+        rows[f"lego-{recipe}"] = Row("lego", ("--recipe", recipe, *WHITE), published, source)
+    for recipe, length in (("3dgs", 6000), ("3dgs-accel", 6000), ("mini-splatting2", 6000), ("adaptive", None)):
+        options = ["--recipe", recipe, "--downscale", "2", *WHITE]
+        options += [] if length is None else ["--iterations", str(length)]
+        is_3dgs = recipe.startswith("3dgs")
+        rows[f"lego-8-{recipe}"] = Row(
+            "lego", tuple(options), 22.48 if is_3dgs else None, EIGHT if is_3dgs else "", True
+        )
+    for recipe in ("3dgs-accel", "adaptive"):
+        rows[f"fern-{recipe}"] = Row("fern", ("--recipe", recipe), None, "")
+    return rows
+
+
+ROWS = _rows()
+
+
+def thin_out(scene: Path, out: Path) -> Path:
+    """Copy the eight training images and every eighth test image of Lego, with their cameras, to a new folder.
+
+    Parameters
+    ----------
+    scene : Path
+        Folder with both files of cameras.
+    out : Path
+        A folder that is there already is returned as it is.
+
+    Raises
+    ------
+    InputError
+        A file of cameras, or a training image, is missing.
+    """
+    if out.exists():
+        return out
+    chosen = []
+    for name in BLENDER_FILES:
+        file = scene / name
+        if not file.is_file():
+            raise InputError(f"{file} is missing: give the folder that `minisplat-ref data lego --out DIR` fetches")
+        content = json.loads(file.read_text(encoding="utf-8"))
+        frames = {Path(frame["file_path"]).name: frame for frame in content["frames"]}
+        if name == BLENDER_FILES[0]:
+            missing = [k for k in SPARSE_VIEWS if f"r_{k}" not in frames]
+            if missing:
+                raise InputError(f"{file} has no image r_{missing[0]}: it is not that of Lego")
+            content["frames"] = [frames[f"r_{k}"] for k in SPARSE_VIEWS]
+        else:
+            content["frames"] = content["frames"][::TEST_EVERY]
+        chosen.append((name, content))
+    for name, content in chosen:
+        for frame in content["frames"]:
+            target = out / f"{frame['file_path']}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(scene / f"{frame['file_path']}.png", target)
+        (out / name).write_text(json.dumps(content), encoding="utf-8")
+    return out
+
+
+def measure(name: str, data: Path, out: Path) -> list[str]:
+    """Train a row, unless that has been done, and return its cells.
+
+    Raises
+    ------
+    InputError
+        The training fails, for a reason that has been printed.
+    """
+    row = ROWS[name]
+    scene = thin_out(data, out.parent / f"{row.data_set}-8") if row.is_sparse else data
+    if not (out / "metrics.json").is_file() and minisplat_ref(["train", str(scene), *row.options, "--out", str(out)]):
+        raise InputError(f"{name}: the training has failed")
+    return cells(name, json.loads((out / "metrics.json").read_text(encoding="utf-8")))
+
+
+def cells(name: str, metrics: dict[str, float]) -> list[str]:
+    """Return the cells of a row, by the metrics of its run."""
+    row, psnr = ROWS[name], metrics["psnr"]
+    published = "-" if row.published is None else f"{row.published:.2f}"
+    difference = "-" if row.published is None else f"{psnr - row.published:+.2f}"
+    seconds = f"{metrics['train_cpu_seconds']:,.0f}"
+    n_gaussians, iterations = f"{metrics['n_gaussians']:,}", f"{metrics['iterations']:,}"
+    return [name, iterations, published, f"{psnr:.2f}", difference, f"{metrics['ssim']:.4f}", n_gaussians, seconds]
+
+
+HEADING = ["row", "iterations", "published (dB)", "ours (dB)", "difference", "SSIM", "Gaussians", "processor seconds"]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure a row, or list all."""
+    parser = argparse.ArgumentParser(prog="python -m data_tools.published_scenes", description=__doc__.split("\n")[0])
+    parser.add_argument("row", nargs="?", choices=list(ROWS), metavar="ROW", help="what to measure (default: list)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="what `minisplat-ref data SET --out DIR` has fetched")
+    parser.add_argument("--out", type=Path, metavar="RUN", help="folder of the run, new or with a run that has ended")
+    args = parser.parse_args(arguments)
+    if args.row is None:
+        for name, row in ROWS.items():
+            print(f"{name:<24}data {row.data_set}, train {' '.join(row.options)}")
+        return 0
+    if args.data is None or args.out is None:
+        parser.error(f"{args.row} needs --data DIR and --out RUN")
+    try:
+        found = measure(args.row, args.data, args.out)
+    except InputError as error:
+        print(f"published_scenes: error: {error}", file=sys.stderr)
+        return 2
+    print(f"{describe_machine()}\n\n{markdown_table(HEADING, [found])}")
+    if ROWS[args.row].source:
+        print(f"\npublished: {ROWS[args.row].source}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""Rows of published scenes: which images remain of Lego, the cells by hand, and a row that is trained."""
+
+import json
+
+import numpy as np
+import pytest
+
+from data_tools import published_scenes
+from data_tools.published_scenes import ROWS, SPARSE_VIEWS, cells, main, thin_out
+from minisplat_ref.errors import InputError
+from minisplat_ref.io import load_scene, write_image
+
+POSE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+
+
+@pytest.fixture
+def lego(tmp_path):
+    """As many images as Lego has, of 12 x 12 pixels, each with its own gray value."""
+    for split, n in (("train", 100), ("test", 200)):
+        frames = []
+        (tmp_path / "lego" / split).mkdir(parents=True)
+        for k in range(n):
+            pose = np.array(POSE)
+            pose[0, 3] = 0.01 * k
+            frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": pose.tolist()})
+            write_image(tmp_path / "lego" / split / f"r_{k}.png", np.full((12, 12, 3), k, np.uint8))
+        content = {"camera_angle_x": 0.69, "frames": frames}
+        (tmp_path / "lego" / f"transforms_{split}.json").write_text(json.dumps(content))
+    return tmp_path / "lego"
+
+
+def test_eight_images_are_trained_on_and_every_eighth_is_measured(lego, tmp_path):
+    scene = load_scene(thin_out(lego, tmp_path / "few"))
+    assert sorted(int(view.image[0, 0, 0]) for view in scene.train_views) == sorted(SPARSE_VIEWS)
+    assert [int(view.image[0, 0, 0]) for view in scene.test_views if view.name.endswith("_8")] == [8]
+    assert len(scene.test_views) == 25
+    by_value = {int(view.image[0, 0, 0]): view.camera.center[0] for view in scene.train_views}
+    assert by_value[26] == pytest.approx(0.26)
+    assert thin_out(tmp_path / "nowhere", tmp_path / "few") == tmp_path / "few"  # it is there already
+
+
+def test_another_scene_is_refused(lego, tmp_path):
+    with pytest.raises(InputError, match=r"transforms_train\.json is missing"):
+        thin_out(tmp_path, tmp_path / "few")
+    content = json.loads((lego / "transforms_train.json").read_text())
+    (lego / "transforms_train.json").write_text(json.dumps({**content, "frames": content["frames"][:50]}))
+    with pytest.raises(InputError, match="has no image r_86"):
+        thin_out(lego, tmp_path / "few")
+    assert not (tmp_path / "few").exists()
+
+
+def test_cells_by_hand():
+    metrics = {"psnr": 35.0, "ssim": 0.98, "n_gaussians": 300_000, "iterations": 30_000, "train_cpu_seconds": 5400.4}
+    expected = ["lego-3dgs", "30,000", "35.78", "35.00", "-0.78", "0.9800", "300,000", "5,400"]
+    assert cells("lego-3dgs", metrics) == expected
+    assert cells("lego-adaptive", metrics)[2:5] == ["-", "35.00", "-"]
+
+
+def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
+    short = ROWS["lego-8-3dgs-accel"]._replace(options=("--recipe", "3dgs-accel", "--iterations", "2"))
+    monkeypatch.setitem(published_scenes.ROWS, "lego-8-3dgs-accel", short)
+    command = ["lego-8-3dgs-accel", "--data", str(lego), "--out", str(tmp_path / "run")]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "| lego-8-3dgs-accel | 2" in printed and "published: issue 40 of Fictionarry/DNGaussian" in printed
+    log = (tmp_path / "run" / "log.jsonl").read_bytes()
+    assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
+    assert main(["lego-8-3dgs", "--data", str(tmp_path / "no"), "--out", str(tmp_path / "b" / "run")]) == 2
+    assert "is missing: give the folder" in capsys.readouterr().err
+    assert main([]) == 0 and "fern-adaptive" in capsys.readouterr().out
