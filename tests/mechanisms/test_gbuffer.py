@@ -75,6 +75,24 @@ def test_between_two_roughnesses_light_is_blended(rng):
     assert_allclose(at[1], 0.75 * at[0] + 0.25 * at[2], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("knot", "rows", "first"), [(1, 8, 1), (2, 4, 2), (4, 2, 4)])
+def test_a_map_is_the_average_over_the_lobe_texel_by_texel(knot, rows, first, rng):
+    """The sum of the docstring for one direction of a map, over the nine parts of each texel; not all in column 0."""
+    image, alpha2 = rng.uniform(size=(8, 16, 3)), KNOTS[knot] ** 4
+    found = prefilter(image).maps[knot]
+    assert found.shape == (rows, 2 * rows, 3)
+    parts, solid = texel_directions(24, 48)
+    for row, column in ((0, 0), (rows - 1, 1), (rows // 2, 2 * rows - 1)):
+        # A direction of a coarser map lies in the first of the columns that it stands for.
+        theta, phi = np.pi * (row + 0.5) / rows, 2 * np.pi * ((first * column + first / 2) / 16 - 0.5)
+        r = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
+        cosines = parts @ r
+        lobe = alpha2 / (np.pi * ((1 + cosines) / 2 * (alpha2 - 1) + 1) ** 2) * np.maximum(cosines, 0) * solid
+        weights = lobe.reshape(8, 3, 16, 3).sum(axis=(1, 3))
+        expected = np.einsum("hw,hwc->c", weights, image) / weights.sum()
+        assert_allclose(found[row, column], expected, rtol=PARITY_FLOAT64, err_msg=f"{row}, {column}")
+
+
 def test_a_fine_environment_keeps_its_mirror_image_and_has_the_averages_of_a_coarse_one(rng):
     coarse = rng.uniform(size=(32, 64, 3))
     fine = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)

@@ -1,4 +1,4 @@
-"""An environment filtered for rough and for matte surfaces: averages of its texels, hence matrices.
+"""An environment filtered for rough and for matte surfaces: averages of its texels.
 
 A rough surface seen from straight above (normal, view and reflection n = v = r, as the split sum of Karis 2013 assumes)
 averages the environment over the lobe of GGX, alpha = roughness^2, half vector h of l and r::
@@ -7,7 +7,10 @@ averages the environment over the lobe of GGX, alpha = roughness^2, half vector 
 
 with the solid angles w of texels, each divided into ``SPLIT`` x ``SPLIT`` parts so that a narrow lobe is not missed.
 There is a map for each of the roughnesses ``KNOTS``, read linearly in between; the first is the environment itself. A
-matte surface averages over the cosine, which a few spherical harmonics hold (Ramamoorthi and Hanrahan 2001)::
+lobe depends on the difference of two azimuths. Averages are correlations along the rows of texels, therefore, and
+products of matrices for each frequency f: ``L^(f) = conj(K^(f)) I^(f)``, backward ``v_I^(f) = K^(f)^T v_L^(f)``.
+
+A matte surface averages over the cosine, which a few spherical harmonics hold (Ramamoorthi and Hanrahan 2001)::
 
     E(n) = sum_k a_l(k) L_k Y_k(n),   L_k = sum_l Y_k(l) L_l w_l,   a = 1, 2/3, 1/4
 
@@ -19,11 +22,14 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.gbuffer.environment import locate, read, read_vjp, texel_directions
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
 from minisplat_ref.types import Floats, Ints
+
+Spectrum = npt.NDArray[np.complex128]
 
 KNOTS = (0.0, 0.3, 0.5, 0.7, 1.0)
 STEPS: Floats = np.array(KNOTS[1:]) - np.array(KNOTS[:-1])
@@ -43,33 +49,34 @@ class Filtered(NamedTuple):
 
 
 def _lobe(height: int, width: int, roughness: float, coarser: int) -> Floats:
-    """Return the weights [h, w, H, W] of the texels for each direction of a map that is ``coarser``.
+    """Return the weights [h, H, W] of the texels for the directions of the first column of a map that is ``coarser``.
 
-    A lobe depends on the difference of two azimuths, so that of the first column is turned into the others.
+    The lobe of another column is turned by the difference of their azimuths.
     """
     fine, solid = texel_directions(height * SPLIT, width * SPLIT)
     first = texel_directions(height // coarser, width // coarser)[0][:, 0]  # [h, 3]
     cosines, alpha2 = first @ fine.reshape(-1, 3).T, roughness**4
     lobe = alpha2 / (np.pi * ((1 + cosines) / 2 * (alpha2 - 1) + 1) ** 2)  # (n.h)^2 = (1 + r.l) / 2
     parts = (lobe * np.maximum(cosines, 0) * solid.ravel()).reshape(-1, height, SPLIT, width, SPLIT)
-    weights = parts.sum(axis=(2, 4))  # [h, H, W]
-    weights /= weights.sum(axis=(1, 2), keepdims=True)
-    turned = np.arange(width) - coarser * np.arange(width // coarser)[:, None]  # [w, W]
-    return np.moveaxis(weights[:, :, turned % width], 2, 1)
+    weights: Floats = parts.sum(axis=(2, 4))  # [h, H, W]
+    return weights / weights.sum(axis=(1, 2), keepdims=True)
 
 
 @functools.lru_cache(4)
-def _matrices(height: int, width: int) -> tuple[tuple[Floats, ...], Floats]:
-    """Return the matrices [h w, H W] of the knots but the first, and that of the irradiance [9, H W]."""
-    n = height * width
-    maps: list[Floats] = [
-        _lobe(height, width, roughness, coarser).reshape(n // coarser**2, n)
-        for roughness, coarser in zip(KNOTS[1:], COARSER[1:], strict=True)
-    ]
+def _filters(height: int, width: int) -> tuple[tuple[Spectrum, ...], Floats]:
+    """Return K^ [W/2 + 1, h, H] of the knots but the first, and the matrix of the irradiance [9, H W]."""
+    knots = zip(KNOTS[1:], COARSER[1:], strict=True)
+    lobes = (_lobe(height, width, roughness, coarser) for roughness, coarser in knots)
+    spectra = tuple(_spectrum(np.moveaxis(lobe, 2, 0)) for lobe in lobes)
     directions, solid = texel_directions(height, width)
     moments: Floats = COSINE[:, None] * sh_basis(directions.reshape(-1, 3), 2).T * solid.ravel()
     moments[1:] -= moments[1:].sum(axis=1, keepdims=True) * solid.ravel() / (4 * np.pi)  # of a constant, exactly 0
-    return tuple(maps), moments
+    return spectra, moments
+
+
+def _spectrum(columns: Floats) -> Spectrum:
+    """Return the spectrum [W/2 + 1, ...] of the columns [W, ...] of a map."""
+    return np.ascontiguousarray(np.fft.rfft(columns.astype(np.float64), axis=0))
 
 
 def check_size(height: int, width: int) -> None:
@@ -105,23 +112,27 @@ def prefilter(image: Floats) -> Filtered:
     check_size(*image.shape[:2])
     finer = max(1, len(image) // ROWS_MAX)
     height, width = image.shape[0] // finer, image.shape[1] // finer
-    matrices, moments = _matrices(height, width)
-    texels = image.reshape(height, finer, width, finer, 3).mean(axis=(1, 3)).reshape(-1, 3)
-    maps = [
-        (matrix @ texels).reshape(height // coarser, width // coarser, 3).astype(image.dtype)
-        for matrix, coarser in zip(matrices, COARSER[1:], strict=True)
-    ]
-    return Filtered((image, *maps), (moments @ texels).astype(image.dtype))
+    lobes, moments = _filters(height, width)
+    texels = image.reshape(height, finer, width, finer, 3).mean(axis=(1, 3))
+    spectrum, maps = _spectrum(np.swapaxes(texels, 0, 1)), []
+    for lobe, coarser in zip(lobes, COARSER[1:], strict=True):
+        columns = np.fft.irfft(np.conj(lobe) @ spectrum, width, axis=0)[::coarser]
+        maps.append(np.ascontiguousarray(np.swapaxes(columns, 0, 1), image.dtype))
+    return Filtered((image, *maps), (moments @ texels.reshape(-1, 3)).astype(image.dtype))
 
 
 def prefilter_vjp(image: Floats, v: Filtered) -> Floats:
-    """Gradient of :func:`prefilter` with respect to the texels [H, W, 3], float64: the transposed matrices."""
+    """Gradient of :func:`prefilter` with respect to the texels [H, W, 3], float64."""
     finer = max(1, len(image) // ROWS_MAX)
-    matrices, moments = _matrices(image.shape[0] // finer, image.shape[1] // finer)
-    v_texels = moments.T @ v.irradiance
-    for matrix, v_map in zip(matrices, v.maps[1:], strict=True):
-        v_texels = v_texels + matrix.T @ v_map.reshape(-1, 3)
-    shared = v_texels.reshape(image.shape[0] // finer, -1, 3) / finer**2
+    height, width = image.shape[0] // finer, image.shape[1] // finer
+    lobes, moments = _filters(height, width)
+    v_spectrum = np.zeros((width // 2 + 1, height, 3), complex)
+    for lobe, coarser, v_map in zip(lobes, COARSER[1:], v.maps[1:], strict=True):
+        v_columns = np.zeros((width, height // coarser, 3))
+        v_columns[::coarser] = np.swapaxes(v_map, 0, 1)
+        v_spectrum += np.swapaxes(lobe, 1, 2) @ _spectrum(v_columns)
+    v_texels = np.swapaxes(np.fft.irfft(v_spectrum, width, axis=0), 0, 1)
+    shared = (v_texels + (moments.T @ v.irradiance).reshape(height, width, 3)) / finer**2
     return v.maps[0] + np.repeat(np.repeat(shared, finer, axis=0), finer, axis=1)
 
 
