@@ -83,14 +83,15 @@ def transforms(folder: Path, seed: int, fov: float) -> Path:
 
 
 def supersplat(folder: Path, seed: int, fov: float, is_nested: bool = False) -> Path:
-    """Write poses: places that are turned by 180 degrees about z."""
+    """Write poses: places that are turned by 180 degrees about z, with the angle of the longer side."""
+    angle = math.degrees(2 * math.atan(0.5 * max(WIDTH, HEIGHT) / focal(fov)))
     poses = [
         {
             "name": "key",
             "frame": 10 * i,
             "position": (position * [-1, -1, 1]).tolist(),
             "target": ((position + 3 * rotation[:, 2]) * [-1, -1, 1]).tolist(),
-            "fov": fov,
+            "fov": angle,
         }
         for i, (position, rotation) in enumerate(views(seed, fov))
     ]

@@ -20,6 +20,7 @@ from data_tools.foreign_files import (
     photographs,
     places,
     ranges,
+    recordings,
     relatives,
     spz_axes,
     terminals,
@@ -46,6 +47,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "headers, models, copies and videos": headers.CASES,
     "folders of other programs": folders.CASES,
     "Gaussians beyond a format": outliers.CASES,
+    "rates and pixels of videos": recordings.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

@@ -5,16 +5,18 @@
 ``camera_path.json``      of nerfstudio: ``camera_path``, each with ``camera_to_world``, ``fov`` in degrees from top to
                           bottom, and the size of all
 ``transforms.json``       any dialect, :mod:`.transforms`; the photographs need not be there
-SuperSplat                ``poses``, or ``poseSets`` of them: ``position`` and ``target``
+SuperSplat                ``poses``, or ``poseSets`` of them: ``position``, ``target``, ``fov`` in degrees of the longer
+                          side
 instant-ngp               ``base_cam.json``: a ``path`` of ``R``, ``T`` and ``fov``
 COLMAP                    a folder with a model, or a scene that has one
 ========================  ==================================================================================
 
 Matrices of nerfstudio have OpenGL's axes (x right, y up, z backward). SuperSplat turns what it shows by 180 degrees
-about z, so x and y of its places change sign, and up is -y. instant-ngp moves a scene into its unit cube: for
-a place p of the scene it has ``0.33 p + 0.5`` with the axes y, z, x; another scale or offset of its transforms.json
-is not in the file of cameras. Places between the cameras of a path are not interpolated. What a lens bends is left
-out, with a warning.
+about z, so x and y of its places change sign, and up is -y; its angle is that of the longer side (``src/camera.ts`` of
+playcanvas/supersplat). instant-ngp moves a scene into its unit cube: for a place p of the scene it has ``0.33 p + 0.5``
+with the axes y, z, x (``nerf_loader.h`` of NVlabs/instant-ngp), and its angle is from top to bottom (``testbed.h``);
+another scale or offset of its transforms.json is not in the file of cameras. Places between the cameras of a path are
+not interpolated. What a lens bends is left out, with a warning.
 """
 
 import math
@@ -32,7 +34,7 @@ from minisplat_ref.io.transforms import frame_camera, read_transforms
 from minisplat_ref.io.viewpoints import Viewpoint, from_json, to_viewpoint
 from minisplat_ref.types import Floats
 
-FOV = 60.0  # degrees from top to bottom, of SuperSplat, where a file has none
+FOV = 60.0  # degrees, of SuperSplat, where a file has none (its ``src/camera-poses.ts``)
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 NGP_AXES = (1, 2, 0)  # of the scene, which are x, y and z of instant-ngp
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -93,12 +95,12 @@ def _numbered(path: Path, entries: Sequence[Any], convert: Any, size: tuple[int,
     return found
 
 
-def _seen_by(fov: Any, where: str, size: tuple[int, int]) -> dict[str, float]:
-    """Return size and focal length of an angle of view from top to bottom, degrees."""
+def _seen_by(fov: Any, where: str, size: tuple[int, int], side: int | None = None) -> dict[str, float]:
+    """Return size and focal length of an angle of view, degrees, along a side in pixels: by default the height."""
     angle = as_number(fov)
     if not 0 < angle < 180:
         raise InputError(f"{where}: fov is {fov!r}, not an angle between 0 and 180 degrees; export it again")
-    focal = 0.5 * size[1] / math.tan(math.radians(angle) / 2)
+    focal = 0.5 * (side or size[1]) / math.tan(math.radians(angle) / 2)
     return {"width": size[0], "height": size[1], "fx": focal, "fy": focal}
 
 
@@ -140,7 +142,7 @@ def _of_supersplat(entry: dict[str, Any], where: str, size: tuple[int, int]) -> 
         raise InputError(f"{where}: position and target are one point; export it again")
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     rotation = np.column_stack([right, np.cross(forward, right), forward])
-    return {**_seen_by(entry.get("fov", FOV), where, size), **_pose(position, rotation)}
+    return {**_seen_by(entry.get("fov", FOV), where, size, max(size)), **_pose(position, rotation)}
 
 
 def _of_instant_ngp(entry: dict[str, Any], where: str, size: tuple[int, int]) -> dict[str, Any]:

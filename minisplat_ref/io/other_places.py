@@ -103,13 +103,13 @@ def _project(file: Path) -> str | None:
         head = opened.read(HEAD).decode(errors="replace")
     if suffix == ".psx" or (suffix == ".xml" and "<document" in head and "<chunk" in head):
         return (
-            f"{file.name} is of Metashape: export File > Export > Export Cameras as COLMAP there, or run"
-            " ns-process-data metashape"
+            f"{file.name} is of Metashape: export it as COLMAP there (since 2.2: File > Export > Export Cameras), or"
+            " run ns-process-data metashape"
         )
     if suffix in (".rcproj", ".rsproj") or (suffix == ".csv" and head.startswith("#name")):
-        return f"{file.name} is of RealityCapture: export the registration as COLMAP there (Alignment > Export)"
+        return f"{file.name} is of RealityCapture: export it as COLMAP there (Alignment > Export Registration)"
     if suffix == ".out" and head.startswith("# Bundle file"):
-        return f"{file.name} is of Bundler: export as COLMAP from its program, or run sfm on the photographs"
+        return f"{file.name} is of Bundler, which is not read: run sfm on its photographs, or export as COLMAP instead"
     if suffix == ".nvm" and head.startswith("NVM_"):
-        return f"{file.name} is of VisualSFM: export as COLMAP from it, or run sfm on the photographs"
+        return f"{file.name} is of VisualSFM, which is not read: run sfm on its photographs"
     return None

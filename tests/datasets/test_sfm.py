@@ -256,6 +256,13 @@ def test_cameras_of_too_few_points_are_taken_back(shots, tmp_path, capsys, monke
     assert_refused(capsys, tmp_path, code, "no two photographs could be placed; take them with more overlap")
 
 
+def test_a_single_camera_that_is_left_is_taken_back_too(shots, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(mapping, "_unsupported", lambda model: sorted(model.reg_frame_ids())[1:])
+    write_photographs(tmp_path / "photos", shots[:5], (24.0, 41.5, 24.0, 41.5, 24.0))
+    code = run_sfm(tmp_path / "photos", tmp_path / "out", "--features", "standard")
+    assert_refused(capsys, tmp_path, code, "no two photographs could be placed; take them with more overlap")
+
+
 def test_points_of_two_views_project_closely(shots, tmp_path, monkeypatch):
     monkeypatch.setattr(mapping, "PAIR_ERROR_MAX", 0.1)
     write_photographs(tmp_path / "photos", shots[:5], (24.0, 41.5, 24.0, 41.5, 24.0))

@@ -45,7 +45,7 @@ def test_poses_of_supersplat_by_hand(tmp_path):
     (ahead, up) = read(tmp_path, {"poses": poses})
     assert_allclose(ahead.camera.center, [1, 2, 3], atol=CLOSED_FORM)
     assert_allclose(axes(ahead.camera), np.eye(3), atol=CLOSED_FORM)
-    assert ahead.camera.fy == pytest.approx(15 * np.sqrt(3))  # 60 degrees
+    assert ahead.camera.fx == ahead.camera.fy == pytest.approx(20 * np.sqrt(3))  # 60 degrees of the longer side, 40
     assert up.name == "up_0001"
     assert_allclose(axes(up.camera)[2], [0, -1, 0], atol=CLOSED_FORM)  # its +y is our -y
     assert (

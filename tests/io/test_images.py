@@ -156,3 +156,25 @@ def test_a_test_view_whose_mask_is_empty_is_set_aside(index, tmp_path):
         loaded = load_scene(scene, test_every=3)
     assert [view.name for view in loaded.test_views] == [names[1 - index]]
     assert [view.name for view in loaded.train_views] == ["0001", "0002", "0004", "0005"]
+
+
+def with_black_masks(folder, names):
+    """Six photographs, of which every third is held out; the masks of some leave no pixel."""
+    scene = write_colmap(folder, n=6)
+    (scene / "masks").mkdir()
+    for name in names:
+        write_image(scene / "masks" / f"{name}.png", np.zeros((HEIGHT, WIDTH), bool))
+    return scene
+
+
+@pytest.mark.parametrize("names", [("0000", "0001", "0002"), ("0000", "0003", "0001", "0002")])
+def test_test_views_do_not_count_among_those_that_training_needs(names, tmp_path):
+    """Two training views of four are left, which is enough, however many test views are set aside."""
+    with pytest.warns(InputWarning, match=f"the masks of {len(names)} of 6 views leave no pixel"):
+        loaded = load_scene(with_black_masks(tmp_path, names), test_every=3)
+    assert [view.name for view in loaded.train_views] == ["0004", "0005"]
+
+
+def test_fewer_than_two_training_views_are_refused(tmp_path):
+    with pytest.raises(InputError, match="training needs at least 2 views"):
+        load_scene(with_black_masks(tmp_path, ("0001", "0002", "0004")), test_every=3)

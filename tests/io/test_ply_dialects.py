@@ -46,6 +46,17 @@ def test_colours_by_hand():
         as_usual("a.ply", columns(**bad))
 
 
+def test_colours_as_floats_by_hand():
+    """White is 1, not 255: (0.25 - 0.5) / 0.28209479 = -0.8862."""
+    colors = {name: np.array([0, 1, 0.25], np.float32) for name in ("red", "green", "blue")}
+    with pytest.warns(InputWarning, match="its colours are red, green, blue"):
+        usual = as_usual("a.ply", columns(**colors))
+    np.testing.assert_allclose(usual["f_dc_2"], [-1.7724539, 1.7724539, -0.8862269], rtol=1e-6)
+    bad = {name: np.array([0, 1, 200], np.float32) for name in ("red", "green", "blue")}
+    with pytest.raises(InputError, match="red goes from 0 to 200"):
+        as_usual("a.ply", columns(**bad))
+
+
 def test_two_scales_and_infinities_by_hand():
     """ln 1000 = 6.9078 below the smaller; +-16 and -30 in the place of infinities, and the others as they were."""
     given = columns(opacity=np.array([np.inf, -np.inf, 2], np.float32), scale_1=np.array([-3, -np.inf, 1], np.float32))

@@ -85,7 +85,11 @@ def complete(model: Any, database: Path, images: Path, work: Path) -> Any:
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     options.triangulation.ignore_two_view_tracks = False
     unsupported = None
-    while unsupported is None or (unsupported and model.num_reg_images() > 0):
+    while unsupported is None or unsupported:
+        if model.num_reg_images() < 2:  # a single photograph has no points
+            for frame_id in model.reg_frame_ids():
+                model.deregister_frame(frame_id)
+            return model
         model = pycolmap.triangulate_points(model, database, images, work, clear_points=True, options=options)
         unsupported = _unsupported(model)
         for frame_id in unsupported:
