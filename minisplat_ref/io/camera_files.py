@@ -12,11 +12,10 @@ COLMAP                    a folder with a model, or a scene that has one
 ========================  ==================================================================================
 
 Matrices of nerfstudio have OpenGL's axes (x right, y up, z backward). SuperSplat turns what it shows by 180 degrees
-about z, so x and y of its places change sign, and up is -y; its angle is that of the longer side (``src/camera.ts`` of
-playcanvas/supersplat). instant-ngp moves a scene into its unit cube: for a place p of the scene it has ``0.33 p + 0.5``
-with the axes y, z, x (``nerf_loader.h`` of NVlabs/instant-ngp), and its angle is from top to bottom (``testbed.h``);
-another scale or offset of its transforms.json is not in the file of cameras. Places between the cameras of a path are
-not interpolated. What a lens bends is left out, with a warning.
+about z, so x and y of its places change sign, and up is -y; its angle is that of the longer side. instant-ngp moves a
+scene into its unit cube: for a place p of the scene it has ``0.33 p + 0.5`` with the axes y, z, x, and its angle is
+from top to bottom; another scale or offset of its transforms.json is not in the file of cameras. Places between the
+cameras of a path are not interpolated. What a lens bends is left out, with a warning.
 """
 
 import math
@@ -34,7 +33,9 @@ from minisplat_ref.io.transforms import frame_camera, read_transforms
 from minisplat_ref.io.viewpoints import Viewpoint, from_json, to_viewpoint
 from minisplat_ref.types import Floats
 
-FOV = 60.0  # degrees, of SuperSplat, where a file has none (its ``src/camera-poses.ts``)
+# playcanvas/supersplat: src/camera-poses.ts for the entries of a pose, src/camera.ts for the side of its angle
+FOV = 60.0  # degrees, of SuperSplat, where a file has none
+# NVlabs/instant-ngp: nerf_loader.h for the unit cube, camera_path.cu for the entries, testbed.h for the side of the angle
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 NGP_AXES = (1, 2, 0)  # of the scene, which are x, y and z of instant-ngp
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])

@@ -79,7 +79,7 @@ def pack(container: Container, header: Mapping[str, Any], streams: Iterable[tupl
     header : mapping
         JSON values; less than 64 KiB of text.
     streams : iterable of pairs of str and bytes
-        The names of the streams, and the streams before packing; each is let go before the next is asked for.
+        The names of the streams, and the streams before packing, which may be made one after the other.
 
     Raises
     ------
@@ -91,10 +91,7 @@ def pack(container: Container, header: Mapping[str, Any], streams: Iterable[tupl
         LEVEL, strategy=zstandard.STRATEGY_BTULTRA2, write_checksum=True, write_content_size=True, **PARAMETERS
     )
     compressor = zstandard.ZstdCompressor(compression_params=parameters)
-    frames: dict[str, list[bytes]] = {}
-    for name, raw in streams:
-        frames[name] = _compress(compressor, name, raw)
-        del raw  # before the next one is made
+    frames = {name: _compress(compressor, name, raw) for name, raw in streams}
     sizes = [[name, sum(map(len, parts))] for name, parts in frames.items()]
     text = json.dumps({**header, "streams": sizes}, separators=(",", ":")).encode()
     assert len(text) <= HEADER_MAX

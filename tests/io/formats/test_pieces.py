@@ -17,6 +17,7 @@ from minisplat_ref.interface import progress
 from minisplat_ref.io import save_ply
 from minisplat_ref.io.formats import glb, mapped, sog
 from minisplat_ref.io.packing import container, deflating, pieces
+from minisplat_ref.io.packing.morton import morton_order
 
 N, ROWS = 1500, 256  # the last piece is not whole
 WRITTEN = [format_ for _, format_ in all_formats() if format_.levels]
@@ -173,3 +174,14 @@ def test_long_streams_hold_what_short_ones_do(monkeypatch):
     monkeypatch.setattr(container, "BLOCK", 700)
     for a, b in zip(format_.decode(whole, "a"), format_.decode(format_.encode(population(N, 3), 5), "b"), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".sog"])
+def test_rows_are_in_morton_order(suffix, monkeypatch):
+    """Neighbours in space are neighbours in the file, also from one piece to the next."""
+    monkeypatch.setattr(pieces, "ROWS", ROWS)
+    gaussians = population(N, 0)
+    back = find_format(f"a{suffix}").decode(content_of(find_format(f"a{suffix}"), gaussians), "a")
+    expected = gaussians.means[morton_order(gaussians.means)]
+    assert np.abs(back.means - expected).max() < 0.01 * np.ptp(gaussians.means)
+    assert np.abs(back.means - gaussians.means).max() > 0.2 * np.ptp(gaussians.means)
