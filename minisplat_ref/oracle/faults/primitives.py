@@ -21,7 +21,7 @@ OPACITY = "opacities times {}"
 ORDER = "the Gaussians not sorted by depth"
 DISTANCE = "distances from the camera in place of depths"
 HALVES = (0.0, 1.0)  # pixel centres
-FACTORS = (0.5, 2.0, -1.0, 0.0)
+FACTORS = (-1.0, 0.5, 2.0, 0.0)
 DIAGONAL = np.array([1.0, -1.0, -1.0])
 
 
