@@ -124,6 +124,13 @@ def _check_parts(extension: Extension, name: str, folder: Path) -> None:
             )
     if not isinstance(extension.representation, Representation):
         raise InputError(f"extension {name} in {folder}: representation is not a Representation")
+    population = extension.representation.population
+    lacking = [field for field in Gaussians._fields if field not in getattr(population, "_fields", ())]
+    if lacking and (extension.save is save_ply or extension.load is load_ply):
+        raise InputError(
+            f"extension {name} in {folder}: its population has no {', '.join(lacking)}, which a PLY of 3DGS has: give"
+            " it a save and a load of its own"
+        )
     if not _takes_three(extension.save):
         raise InputError(f"extension {name} in {folder}: save does not take a path, a population and a label")
     for recipe in extension.recipes:

@@ -16,6 +16,7 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.calibration import EXPOSURE, REFINED, TRACKS, exposures_of_gains
 from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.training.pace import Decision, Pace
+from minisplat_ref.training.population_check import check_population
 from minisplat_ref.training.recipe_settings import apply_decisions, settings_of
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
@@ -66,6 +67,7 @@ def initial_state(
         gaussians = populate(rng)
     gaussians = contiguous(gaussians)
     shared = dict(representation.shared(scene, rng))
+    check_population(recipe, gaussians, shared)
     for calibration in recipe.active_calibrations:
         shared |= calibration.initial(n_views)
     pace = Pace()

@@ -164,9 +164,11 @@ def _write_page(args: argparse.Namespace) -> int:
     source = open_source(path, args.extension, axes=args.axes, up=args.up)
     trained = source.trained
     population = trained.model.gaussians
-    if further := [name for name in population._fields if name not in Gaussians._fields]:
+    own, plain = population._fields, Gaussians._fields
+    if wrong := [name for name in own if name not in plain] or [name for name in plain if name not in own]:
         raise InputError(
-            f"{path} has {', '.join(further)}, which a page does not show: look at it with minisplat-ref view {path}"
+            f"{path} {'has' if wrong[0] in own else 'lacks'} {', '.join(wrong)}, and a page shows plain Gaussians: look"
+            f" at it with minisplat-ref view {path}"
         )
     name = scene_title(Path(load(path).scene)) if path.is_dir() and (path / CONFIG).is_file() else path.resolve().name
     cameras = [view for view in source.cameras if view.split != "test"] or source.cameras

@@ -166,6 +166,8 @@ def check_population(population: Any, format_: Format, what: str) -> None:
     InputError
         It has.
     """
+    if lacking := [name for name in Gaussians._fields if name not in population._fields]:
+        raise InputError(f"{what} has no {', '.join(lacking)}, which a {format_.suffix} holds: convert it to a PLY")
     further = [name for name in population._fields if name not in Gaussians._fields]
     if further:
         raise InputError(

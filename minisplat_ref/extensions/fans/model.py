@@ -35,7 +35,7 @@ from minisplat_ref.rendering import Renderer, RenderGradient, Request
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.rates import LogLinear, Rates
-from minisplat_ref.training.representation import WORLD_UNITS, Representation
+from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints, Model, RenderOutput, View
@@ -289,7 +289,7 @@ def channels(wants: frozenset[str]) -> dict[str, slice]:
 FANS_OF_GAUSSIANS = Representation(
     "fans",
     population=Fans,
-    units={**WORLD_UNITS, "rims": Unit.PLACE},
+    units={"means": Unit.PLACE, "rims": Unit.PLACE},
     extend=partial(as_fans, **FanShape()._asdict()),
     renderer=Renderer("fans", partial(render_fans, max_layers=None), render_fans_vjp, channels),
     rates=Rates(
