@@ -31,7 +31,7 @@ def split_releases():
 
 
 def test_version_is_stated_once():
-    assert PROJECT["dynamic"] == ["version"] and "version" not in PROJECT
+    assert PROJECT["dynamic"] == ["version", "readme"] and "version" not in PROJECT
     assert re.fullmatch(r"\d+\.\d+\.\d+", minisplat_ref.__version__)
 
 

@@ -1,5 +1,6 @@
 """What is built: a wheel of the package alone, since ``data_tools`` is somebody else's name on the package index."""
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import minisplat_ref
+from data_tools.package_readme import without_relative_links
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,6 +52,30 @@ def test_metadata_of_the_wheel(dist):
     urls = dict(line.split(", ") for line in metadata.get_all("Project-URL"))
     assert urls == project["urls"] and all(url.startswith("https://") for url in urls.values())
     assert set(metadata.get_all("Classifier")) == set(project["classifiers"])
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    text = metadata.get_payload()
+    assert text.lstrip().startswith("# minisplat_ref") and "## Installation" in text
+    assert all(target.startswith(("https://", "#")) for target in re.findall(r"\]\(([^)]+)\)", text))
+
+
+def test_the_readme_of_the_package_index():
+    """Links lead to the released version; without a repository they become their texts."""
+    text = (
+        "![A film](docs/a.webp)\n\n[guide](docs/GUIDE.md#films), [paper](https://doi.org/1), [below](#there) [x](./y)"
+    )
+    assert without_relative_links(text, "https://github.com/me/it/", "1.2.3") == (
+        "![A film](https://github.com/me/it/raw/v1.2.3/docs/a.webp)\n\n"
+        "[guide](https://github.com/me/it/blob/v1.2.3/docs/GUIDE.md#films), [paper](https://doi.org/1),"
+        " [below](#there) [x](https://github.com/me/it/blob/v1.2.3/y)"
+    )
+    assert without_relative_links(text, None, "1.2.3") == "guide, [paper](https://doi.org/1), [below](#there) x"
+
+
+def test_the_index_can_show_it(dist):
+    """``twine check`` as before an upload, which nothing here does."""
+    pytest.importorskip("twine", reason="needs twine, of the extra [dev]")
+    files = [str(path) for path in dist.iterdir()]
+    subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *files], check=True, capture_output=True)
 
 
 def test_source_distribution_has_tests_and_documentation_but_no_stored_notebooks(dist):

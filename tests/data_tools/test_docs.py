@@ -11,7 +11,7 @@ from minisplat_ref.extensions import folders
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
-EXAMPLES = {"images/", "mine/faint/__init__.py", "my_renderer/__init__.py", "tests/test_oracle.py"}  # of a user
+EXAMPLES = {"images/", "mine/round/__init__.py", "my_renderer/__init__.py", "tests/test_oracle.py"}  # of a user
 
 
 def inline_code_of(page):

@@ -2,13 +2,16 @@
 
 import inspect
 import json
+import re
 from fractions import Fraction
 from functools import partial
 
 import numpy as np
 import pytest
 
+from minisplat_ref.app.cli import demo
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_recipe, load_extensions
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
 from minisplat_ref.training.losses import LossTerm
@@ -344,3 +347,27 @@ def test_description_is_json_and_tells_settings_apart():
     assert densify["settings"] == {"threshold": 2e-4, "size_fraction": 0.01}
     other = recipe._replace(events=(Every(100, partial(gaussian_splatting.prune_faint, min_opacity=0.1)),))
     assert json.loads(json.dumps(describe(other))) != description
+
+
+ADDS_ROWS = re.compile("clone|split|densif|reinit|grow|insert|promote|control|halve_large$")
+
+
+@pytest.mark.parametrize("iterations", [30, 100, 300, 590, 750, 1500, 3000, 18_000])
+@pytest.mark.parametrize("name", [*RECIPES, *(recipe.name for e in load_extensions() for recipe in e.recipes)])
+def test_no_schedule_ends_right_after_a_densification(name, iterations):
+    """What was added has two fifths of the iterations to be trained, or as large a part as in the published length."""
+    recipe = find_recipe(name)
+    if recipe.cooling is not None:
+        return  # it decides when its growth ends, and cools down for half as long
+
+    def last_share(recipe):
+        adding = [e for e in recipe.events if isinstance(e, DatedEvent) and ADDS_ROWS.search(action_name(e))]
+        due = (step for step in range(recipe.iterations, 0, -1) if any(event.is_due(step) for event in adding))
+        return next(due, 0) / recipe.iterations
+
+    assert last_share(find_recipe(name, iterations)) <= max(0.6, last_share(recipe) + 0.5 / iterations)
+
+
+def test_the_demo_ends_with_its_schedule():
+    """It trains its recipe whole: the first part of a longer schedule would end while Gaussians are added."""
+    assert demo.RECIPE == "mini-splatting2" and not hasattr(demo, "SCHEDULE_ITERATIONS")

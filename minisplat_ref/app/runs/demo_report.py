@@ -48,8 +48,8 @@ DEPTH_TEXT = """\
 Nothing taught the Gaussians depth. Here is the distance that they came to, next to the exact one
 of the ray tracer. Near is bright; beside it is the difference relative to the true depth."""
 CURVES_TEXT = """\
-Where the number of Gaussians jumps, those with a large gradient were cloned or split: the loss
-jumps with it, and recovers."""
+The number of Gaussians grows at once, by clones of all that matter in an image, and falls when those of
+little weight go: the loss jumps with it, and recovers."""
 
 
 class ViewImages(NamedTuple):
@@ -126,7 +126,7 @@ def report_html(
         ("Scene", f"synthetic room, {n_train} training and {n_test} test views of {size} pixels, in {settings.scene}"),
         (
             "Recipe",
-            f"{settings.recipe}, the first {metrics['iterations']} of its {settings.schedule_iterations:,} iterations",
+            f"{settings.recipe}, {metrics['iterations']:,} iterations, into which its 18,000 are compressed",
         ),
         ("Seed", f"{settings.seed}: the same seed gives the same result"),
         ("Conventions", f"{settings.profile}, the default"),
@@ -136,7 +136,9 @@ def report_html(
         ("Files", f"{folder.resolve()}: Gaussians, metrics, log, checkpoint, images"),
     ]
     steps = [
-        part for text, lines in _next_steps(folder, metrics["iterations"]) for part in (paragraph(text), code(lines))
+        part
+        for text, lines in _next_steps(folder, settings.recipe, metrics["iterations"])
+        for part in (paragraph(text), code(lines))
     ]
     sections = [
         *([shown] if shown else []),
@@ -168,16 +170,17 @@ def _depth_panel(view: ViewImages) -> str:
     return panel(f"{view.name}: median difference {100 * median:.1f} %", images, n_columns=2)
 
 
-def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
+def _next_steps(folder: Path, recipe: str, n_iterations: int) -> list[tuple[str, str]]:
     """Return sentences, each with lines to copy."""
     live, own = live_view(folder), own_photographs()
+    longer = ("--recipe", recipe, "--iterations", str(2 * n_iterations))
     return [
         (f"{own.purpose}:", own.line),
         (f"{live.purpose}:", live.line),
         ("Walk around the room:", command("render", folder, "--cameras", "orbit", "--depth")),
         (
-            "Train on, for a few minutes more:",
-            command("train", "--resume", folder, "--iterations", str(2 * n_iterations)),
+            "Train for longer, in a few minutes more:",
+            command("train", folder / "scene", *longer, "--out", folder.parent / f"{folder.name}-longer"),
         ),
         (
             "Render the same views with the reference, which is NumPy and made to be read:",
