@@ -4,6 +4,7 @@ Each test skips where its program is not installed. ``npm install @playcanvas/sp
 ``node_modules/.bin/splat-transform``, whose folder the PATH must name; gsply comes by pip, pycolmap with ``[photos]``.
 """
 
+import json
 import shutil
 import subprocess
 import warnings
@@ -14,6 +15,7 @@ from numpy.testing import assert_allclose
 
 from compact import population, rotation_error
 from data_tools.foreign_files.ksplat import write_ksplat
+from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, save_ply
@@ -214,3 +216,20 @@ def test_pycolmap_reads_the_scenes_that_we_write(tmp_path):
         pose, camera = image.cam_from_world(), views[image.name]
         assert_allclose(pose.rotation.matrix(), camera.cam_from_world_R, atol=1e-6)  # digits of the text
         assert_allclose(pose.translation, camera.cam_from_world_t, atol=1e-6)
+
+
+def test_levels_of_detail(splat_transform, tmp_path):
+    """splat-transform reads ``lod-meta.json``: each level with its Gaussians, in the axes of the PLY."""
+    write_scene(
+        make_scene("room", n_views=6, width=32, height=24, supersampling=1, n_points=400), tmp_path / "nook", {}
+    )
+    training = ("--recipe", "3dgs-accel", "--iterations", "30", "--test-every", "4", "--out", str(tmp_path / "run"))
+    assert main(["train", str(tmp_path / "nook"), *training]) == 0
+    assert main(["convert", str(tmp_path / "run"), str(tmp_path / "levels" / "lod-meta.json")]) == 0
+    counts = json.loads((tmp_path / "levels" / "lod-meta.json").read_text())["counts"]
+    assert len(counts) >= 3
+    for level, count in enumerate(counts):
+        splat_transform(tmp_path / "levels" / "lod-meta.json", "-L", level, tmp_path / f"{level}.ply")
+        assert len(load_ply(tmp_path / f"{level}.ply").means) == count
+    finest, own = load_ply(tmp_path / "0.ply").means, load_ply(tmp_path / "run" / "point_cloud.ply").means
+    assert_allclose(np.sort(finest, axis=0), np.sort(own, axis=0), atol=2e-3 * np.abs(own).max())

@@ -22,6 +22,7 @@ written:
   .spz .sog .splat .glb .compressed.ply   for other programs
   .msz    ours, with a stated error (minisplat-ref extensions compression)
   .html   one page to send, which shows the scene in a browser, offline
+  lod-meta.json   levels of detail that PlayCanvas streams, in a new folder
 
 Compact formats have levels of precision, of which 0 is the finest:
 
@@ -29,6 +30,7 @@ Compact formats have levels of precision, of which 0 is the finest:
   --max-drop dB   the coarsest level that loses at most so much PSNR, measured
                   on at most 24 training views of the run, or of --scene
 """
+LEVELS = "lod-meta.json"
 EPILOG = """\
 --axes is that of the .spz that is read, or written if none is: RUB by its
 specification, RDF (those of the PLY) in some programs.
@@ -36,7 +38,6 @@ specification, RDF (those of the PLY) in some programs.
 examples:
   minisplat-ref convert runs/fox fox.ply
   minisplat-ref convert runs/fox fox.msz --max-drop 0.1
-  minisplat-ref convert fox.msz fox.spz
   minisplat-ref convert runs/fox fox.html
 """
 
@@ -87,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
     out: Path = args.output
     if out.suffix.lower() == ".html":
         return _write_page(args)
+    if out.name == LEVELS:
+        return _write_levels(args)
     format_ = choose_format(out)
     if args.up is not None and (format_ is None or format_.suffix != ".glb"):
         raise InputError(f"--up is for pages (.html) and for .glb, in which y is up; {out.suffix} has the scene's axes")
@@ -181,6 +184,21 @@ def _write_page(args: argparse.Namespace) -> int:
     parts = [*trained.model.shared, *([] if trained.renderer.name == SPLATTING.name else [trained.renderer.name])]
     if parts:
         print(f"minisplat-ref: the page shows plain 3DGS, without {', '.join(parts)}", file=sys.stderr)
+    return 0
+
+
+def _write_levels(args: argparse.Namespace) -> int:
+    """Write the levels of detail of a run, and print what each loses."""
+    from minisplat_ref.app.runs.levels import write_levels
+    from minisplat_ref.app.runs.opened_run import open_run
+
+    options = ("max_bytes", "max_drop", "level", "downscale", "extension", "axes", "up")
+    if given := [name for name in options if getattr(args, name) is not None]:
+        raise InputError(f"levels have their own sizes, so --{given[0].replace('_', '-')} means nothing: leave it out")
+    levels = write_levels(open_run(args.input, args.scene), args.output)
+    print(f"{len(levels)} levels of detail in {args.output}, which PlayCanvas streams; on training views they lose")
+    for number, level in enumerate(levels):
+        print(f"  level {number}: {level.n_gaussians:,} Gaussians, {level.drop:.2f} dB of PSNR")
     return 0
 
 

@@ -125,7 +125,7 @@ def choose_format(path: Path) -> Format | None:
     format_ = find_format(path)
     if format_ is None and path.suffix != ".ply":
         written = [known.suffix for _, known in all_formats() if known.levels]
-        suffixes = " or ".join([".ply", *written, ".html (a page to send)"])
+        suffixes = " or ".join([".ply", *written, ".html (a page to send)", "lod-meta.json"])
         raise InputError(f"{path} is not named like a PLY or another format: give a name that ends in {suffixes}")
     if format_ is not None and not format_.levels:
         raise InputError(f"{path}: a {format_.suffix} is read, but not written: choose another format")
