@@ -122,6 +122,21 @@ def test_nothing_that_a_ray_meets_is_culled_beside_the_camera(optics):
     assert not found.radii[~is_reached].any()
 
 
+def test_a_gaussian_with_a_sigma_point_out_of_sight_has_no_bounds():
+    """A needle along the axis, half of which is behind the camera: one sigma point is 0.173 x 4 before 0.5, at -0.19.
+
+    Its other sigma points are all in the pixel of the axis, so bounds of these would hold a few pixels.
+    """
+    camera = make_camera()
+    needle = Primitives(
+        np.array([[0, 0, 0.5]]), np.array([[1.0, 0, 0, 0]]), np.array([[0.01, 0.01, 4]]), np.full(1, 0.9)
+    )
+    found = project(needle, camera, GSPLAT_MAIN)
+    assert found.boxes[0].tolist() == [0, 0, 24, 18] and found.radii[0].tolist() == [24, 18]
+    short = project(needle._replace(scales=np.array([[0.01, 0.01, 0.5]])), camera, GSPLAT_MAIN)
+    assert 0 < short.radii.max() < 9
+
+
 # --- the renderer ---
 
 

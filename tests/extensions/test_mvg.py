@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.mvg import recipe
+from minisplat_ref.extensions.mvg import insertion, recipe
 from minisplat_ref.extensions.mvg.insertion import (
     Insertions,
     Photographed,
@@ -167,6 +167,35 @@ def test_nothing_is_proposed_where_nothing_agrees(rng):
     views = [seen_from(0.0, 3.0), seen_from(0.0, 3.5)]
     found = propose(views, Rules(Tolerances(n_views=1), 1, (1, 1, 1)), rng)
     assert len(found.points) == 0 and len(drop_covered(found, np.zeros((2, 3))).points) == 0
+
+
+def test_normals_are_those_of_the_smoothed_depths(rng):
+    """The depths that others agree on are a slope, on which the points are; smoothed, they were flat: the normals."""
+    view = seen_from(0.0, 3.0)
+    slope = 3 + 0.05 * np.arange(24) + np.zeros((18, 1))
+    agreed = view._replace(seen=view.seen._replace(depth=slope))
+    found = insertion._propose_in_view(agreed, view.seen.depth, (0.0, 0.0), (1, 1, 1), 0, rng)
+    assert len(found.normals) == 16 * 22
+    assert_allclose(found.normals, np.tile([0, 0, -1], (16 * 22, 1)), atol=CLOSED_FORM)
+    assert_allclose(found.points[:, 2].reshape(16, 22), slope[1:-1, 1:-1], rtol=CLOSED_FORM)
+
+
+def test_depths_to_be_inserted_are_smoothed():
+    """A pixel that is 0.01 too far, amid a plain photograph, is nearer to its neighbours afterwards."""
+    camera = Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 4.5, 3.5, 9, 7)
+    image = np.full((7, 9, 4), 2.0)
+    image[3, 4, 3] = 2.01
+
+    class Settings:
+        renderer, conventions = SURFELS, GSPLAT_MAIN
+
+        @staticmethod
+        def render_view(model, view, wants, sh_degree):
+            return RenderOutput(image, np.ones((7, 9)), None, None), None
+
+    view = View("v", camera, np.full((7, 9, 3), 51, np.uint8), None)
+    depth = photographed(Model(None), view, Settings()).seen.depth
+    assert 2 < depth[3, 4] < 2.005 and 2 < depth[3, 5] < 2.005
 
 
 def insertions_at(points, radii):

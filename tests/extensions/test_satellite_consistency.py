@@ -103,3 +103,11 @@ def test_only_pixels_that_agree_count(plateau, monkeypatch):
     added[:12, :, 6], added[12:, :, 6] = 0.5, 1.5
     found = consistency(monkeypatch, plateau, (0.0, 0.0), lambda image: image + added)
     assert found == pytest.approx(0.01 * 0.5, abs=CLOSED_FORM)
+
+
+def test_pixels_that_leave_the_image_do_not_count(plateau, monkeypatch):
+    """A shear of -1 pixel per metre moves by 6: of 24 columns 18 are seen, and only they are off by what is added."""
+    added = np.zeros((24, 24, 7))
+    added[:, 18:, 6] = 0.9  # of those that leave
+    clean = consistency(monkeypatch, plateau, (-1.0, 0.0))
+    assert consistency(monkeypatch, plateau, (-1.0, 0.0), lambda image: image + added) == pytest.approx(clean, rel=1e-6)

@@ -181,6 +181,14 @@ def test_what_views_agree_on():
     assert agree(views[0], []).depth.max() == 0
 
 
+@pytest.mark.parametrize(("factor", "agrees"), [(1.009, True), (0.991, True), (1.012, False), (0.985, False)])
+def test_depths_agree_within_one_percent(factor, agrees):
+    """Of the same camera, so that the pixel is right: a hundredth of the depth is the limit."""
+    view = DepthView(np.full((18, 24), 4.0), camera_at(0.0))
+    found = agree(view, [view._replace(depth=factor * view.depth)], Tolerances(n_views=1))
+    assert (found.n_agreeing[5:-5, 5:-5] == agrees).all()
+
+
 def test_outliers_do_not_agree_and_the_truth_does():
     made = make_scene("staircase", n_views=12, width=64, height=48, supersampling=1, n_points=50, test_every=0)
     rng = np.random.default_rng(0)

@@ -1,5 +1,7 @@
 """Shading once per pixel: environment, averages, split sum, shading, tone, visibility; closed forms and quadrature."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -8,6 +10,7 @@ from scipy.integrate import dblquad, quad
 from gradcheck import check_inner_products
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.gbuffer import renderer
 from minisplat_ref.mechanisms.gbuffer.brdf import hammersley, integrate, reflectance
 from minisplat_ref.mechanisms.gbuffer.environment import locate, read, texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import read_environment, relight
@@ -17,8 +20,9 @@ from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface, shade, sha
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp, untone
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
+from minisplat_ref.rendering import Request
 from minisplat_ref.rendering.backends import CPU, REFERENCE
-from minisplat_ref.types import Model, Primitives
+from minisplat_ref.types import Camera, Model, Primitives
 from tolerances import CLOSED_FORM, ENVIRONMENT_TEXEL, PARITY_FLOAT64, SPLIT_SUM
 
 
@@ -308,3 +312,23 @@ def test_maps_show_means():
     assert map_image("roughness", np.array([[[0.25], [0.0]]]), alpha).tolist() == [[[128] * 3, [0] * 3]]
     assert map_image("normal", np.array([[[0, 0, -0.2], [0, 0, 0]]]), alpha).tolist() == [[[128, 128, 0], [0] * 3]]
     assert map_image("albedo", np.full((1, 2, 3), 0.25), alpha)[0, 0, 0] == 188
+
+
+@pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=lambda backend: backend.name)
+@pytest.mark.parametrize(("distance", "share"), [(0.03, 1.0), (0.05, 0.1), (0.3, 0.1), (50.0, 0.1), (1e4, 0.1)])
+def test_a_reflected_ray_begins_beyond_its_surface_and_does_not_end(distance, share, backend):
+    """A mirror 2 before the camera, which half of the pixel shows, sends the axis back; a disc of opacity 0.9 is in it.
+
+    What is nearer than 2 % of the depth, 0.04, counts as the mirror itself; behind the camera everything counts.
+    """
+    camera = Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 0.5, 0.5, 1, 1)
+    disc = Primitives(
+        np.array([[0, 0, 2 - distance]]), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), 0.5), np.array([0.9])
+    )
+    towards = np.array([[0.0, 0, -1]])
+    surface = Surface(np.ones((1, 3)), np.ones(1), np.zeros(1), towards, towards)
+    output = SimpleNamespace(image=np.array([[[0.0, 0, 0, 0.5 * 2]]]))  # the depth times the alpha
+    pixels = SimpleNamespace(rows=np.array([0]), alpha=np.array([0.5]))
+    seen = SimpleNamespace(camera=camera, primitives=disc)
+    found = renderer._visibility(surface, output, pixels, seen, Request(conventions=GSPLAT_MAIN, backend=backend))
+    assert_allclose(found, [share], atol=CLOSED_FORM)
