@@ -251,6 +251,36 @@ def test_the_affine_projection_is_exact_and_so_is_its_gradient(conventions):
     check_inner_products(function, gradient, (*p, A, b), v, rng, names=names)
 
 
+def test_a_pinhole_sees_what_is_in_front_however_near():
+    camera = make_camera()
+    assert model_of(camera).is_seen(np.array([[0, 0, 1e-6], [0, 0, 0.0], [0, 0, -1.0]]), camera).tolist() == [1, 0, 0]
+
+
+def test_what_lies_behind_a_ray_or_beyond_the_fold_is_not_hit():
+    """A Gaussian moved behind the camera has no alpha; one beyond the fold would have a pixel in the image."""
+    camera, p = make_camera(64, 48), primitives()
+    found = ray_footprints.project(p, camera, GSPLAT_MAIN)
+    ids, centers = np.arange(len(p.means)), np.array([[32.5, 24.5]])
+    assert ray_footprints.hit(found, ids, centers).unclamped.max() > 0.01
+    behind = found._replace(positions=-found.positions)
+    assert not ray_footprints.hit(behind, ids, centers).unclamped.any()
+    folded = make_camera(64, 48, fx=80.0, fy=80.0)._replace(optics=FOLDED)
+    wide = p._replace(means=np.tile([[3.6, 0, 3.0]], (12, 1)))  # r = 1.2, of which the pixel is that of 0.336
+    assert model_of(folded).project(wide.means, folded)[0, 0] < 64
+    assert not ray_footprints.project(wide, folded, GSPLAT_MAIN).radii.any()
+    assert ray_footprints.project(p, folded, GSPLAT_MAIN).radii.any()
+
+
+def test_planes_cull_by_parallel_rays_only_where_the_camera_has_them():
+    """Behind the near plane nothing is seen; a satellite's altitudes are depths of both signs."""
+    camera, p = make_camera(64, 48, fx=20.0, fy=20.0), primitives()
+    behind = p._replace(means=p.means - [0, 0, 6])
+    assert project(*p, orthographic(camera, GSPLAT_MAIN), GSPLAT_MAIN).radii.all()
+    assert not project(*behind, orthographic(camera, GSPLAT_MAIN), GSPLAT_MAIN).radii.any()
+    open_ended = orthographic(camera, GSPLAT_MAIN)._replace(near=-np.inf)
+    assert project(*behind, open_ended, GSPLAT_MAIN).radii.all()
+
+
 def satellite_camera():
     return turned_camera()._replace(fx=30.0, fy=20.0, optics=Optics("affine", (0.3, 48.0, 0.0, 0.0, 0.0)))
 
