@@ -11,6 +11,9 @@ from data_tools.published.repositories import (
     GAMES_MODEL,
     GAUSTUDIO_SKY,
     GS_ARGUMENTS,
+    MCMC_COPIES,
+    MCMC_MODEL,
+    MCMC_TRAIN,
     MIP_ARGUMENTS,
     OMG_MODEL,
     POLYGONS,
@@ -88,6 +91,23 @@ CONSTANTS: Table = {
         THRESHOLD=says(2e-4, "densify_grad_threshold"),
         SIZE_FRACTION=says(0.01, "percent_dense"),
         DSSIM_WEIGHT=says(0.2, "lambda_dssim"),
+    ),
+    **_code(
+        f"{_EXTENSIONS}mcmc.model",
+        MCMC_TRAIN,
+        SHARPNESS=says(100.0, r"op_sigmoid\(x, k=([\d.]+)"),
+        THRESHOLD=says(0.995, r"op_sigmoid\(x, k=100, x0=([\d.]+)\)"),
+    ),
+    **_code(
+        f"{_EXTENSIONS}mcmc.model",
+        MCMC_COPIES,
+        COPIES_MAX=says(50, "N_max", r"max=N_max-(\d)", numbers=(51, 1)),
+    ),
+    **_code(
+        f"{_EXTENSIONS}mcmc.model",
+        MCMC_MODEL,
+        OPACITY_MIN=says(0.005, r"float32\)\.eps, min=([\d.]+)\)"),
+        OPACITY_MAX=has(1 - 2.0**-23, "max=1.0 - torch.finfo(torch.float32).eps"),
     ),
     **_code(
         f"{_EXTENSIONS}omg.model",

@@ -42,6 +42,14 @@ SDF_SCRIPT = _SDF("scripts/train_scripts/train_shiny.sh")
 _MIP = partial(Source, "autonomousvision/mip-splatting", "dda02ab5ecf45d6edb8c540d9bb65c7e451345a9")
 MIP_ARGUMENTS, MIP_MODEL, MIP_TRAIN = _MIP("arguments/__init__.py"), _MIP("scene/gaussian_model.py"), _MIP("train.py")
 
+_MCMC = partial(Source, "ubc-vision/3dgs-mcmc", "7b4fc9f76a1c7b775f69603cb96e70f80c7e6d13")
+MCMC_ARGUMENTS, MCMC_MODEL, MCMC_TRAIN = (
+    _MCMC("arguments/__init__.py"),
+    _MCMC("scene/gaussian_model.py"),
+    _MCMC("train.py"),
+)
+MCMC_COPIES = _MCMC("utils/reloc_utils.py")
+
 ANALYTIC = Source(
     "lzhnb/Analytic-Splatting",
     "a905939d4c5d9ac4a1500b8eca258028462de941",

@@ -177,6 +177,7 @@ def run_events(state: TrainState, training: Training, stepped: Stepped) -> StepR
         case.step,
         recipe.iterations,
         recipe.cooling,
+        partial(recipe.rates_at, case.step, case.scene.extent, state.pace),
         training.n_halvings,
         say=notes.append,
         fetch=fetch,

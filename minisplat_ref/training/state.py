@@ -6,7 +6,7 @@ record, for example why it has changed nothing. Only :func:`apply_edit` and :fun
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
 from minisplat_ref.training.adam import AdamState, zero_moments
 from minisplat_ref.training.pace import Cooling, Decision, Pace
 from minisplat_ref.training.representation import GAUSSIANS, Representation
-from minisplat_ref.types import FILE_FRAME, Floats, Frame, Gaussians, Ints, Model, RenderOutput, Scene, View
+from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Gaussians, Ints, Model, RenderOutput, Scene, View
 
 DEGREES = "sh_degree"
 """Name of the statistic by which each Gaussian has a degree of the spherical harmonics for itself."""
@@ -90,6 +90,9 @@ class Iteration(NamedTuple):
     """Upper limit of the training's length."""
     cooling: Cooling | None = None
     """The end of a training without a schedule."""
+    rates: Callable[[], Mapping[str, float]] = lambda: NOTHING
+    """Returns the learning rates of the iteration's step by the name of the parameter, per world unit where they are
+    per unit of the extent."""
     n_halvings: int = 0
     """Number of times that the views were halved in width and height."""
     say: Callable[[str], None] = ignore_message
