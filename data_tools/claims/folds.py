@@ -27,20 +27,21 @@ from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_OUT, SEEDS, ar
 from data_tools.claims.kit.coverage import count_covering_views
 from data_tools.claims.kit.figures import standard_error, subplots
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.extensions.extension import find_recipe, load_extensions
 from minisplat_ref.interface.palette import SERIES
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.scene import camera_extent
-from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.adaptive.numbers import TRAIN_VIEWS_MIN
 from minisplat_ref.metrics import ViewMetrics, correct_colors, evaluate, psnr
-from minisplat_ref.rendering import RenderSettings
+from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.strategy.line_of_sight import hidden_share
 from minisplat_ref.strategy.track_gains import store_gains
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations
-from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations, settings_of
+from minisplat_ref.training.representation import GAUSSIANS
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.training.state import StepReport
-from minisplat_ref.types import Bools, Floats, Ints, Scene, View, number_views
+from minisplat_ref.types import Bools, Floats, Gaussians, Ints, Scene, View, number_views
 
 KNOWN = 2  # training photographs that must show a pixel's surface
 N_MOMENTS = 12  # evaluations of a training of ITERATIONS iterations
@@ -105,15 +106,27 @@ def known_points(train_views: Sequence[View], n_points: int) -> Bools:
 
 
 def recipe_of(text: str) -> Recipe:
-    """Return a recipe by its name, with settings if there are: ``adaptive+min_slope=0.5``.
+    """Return a recipe by its name, with settings if there are: ``adaptive+min_slope=0.5``, ``mcmc+budget=20000``.
 
-    Recipes with a schedule have 3,000 iterations.
+    Recipes with a schedule have 3,000 iterations. A setting that the recipe lacks may be a loss term of an extension
+    for any recipe, with which it is then trained: ``adaptive+sfm_depth=0.1``.
     """
+    names = [setting.partition("=")[0] for setting in text.split("+")[1:]]
 
     def find(name: str) -> Recipe:
-        return get_recipe(name) if get_recipe(name).cooling is not None else get_recipe(name, ITERATIONS)
+        recipe = find_recipe(name)
+        lacking = [setting for setting in names if setting not in settings_of(recipe)]
+        if lacking and (extension := _extension_of_term(lacking[0])) is not None:
+            recipe = find_recipe(name, extension=extension)
+        return recipe if recipe.cooling is not None else scale_recipe(recipe, ITERATIONS)
 
     return configure_by_name(find, text)
+
+
+def _extension_of_term(name: str) -> str | None:
+    """Return the extension that offers a loss term to any recipe; None if there is none."""
+    extensions = (e for e in load_extensions() if e.representation == GAUSSIANS)
+    return next((e.name for e in extensions if any(term.name == name for term in e.losses)), None)
 
 
 def measure(fold: Fold, recipe: Recipe, seed: int) -> dict[str, Any]:
@@ -146,8 +159,9 @@ def measure(fold: Fold, recipe: Recipe, seed: int) -> dict[str, Any]:
         photographs.append(describe_photograph(view, image, metrics, next(coverage)))
 
     evaluate_now(state, on_view)
+    is_plain = (recipe.representation.population, recipe.representation.renderer) == (Gaussians, SPLATTING)
     hidden = [
-        hidden_share(state.model, views, scene.points, RenderSettings(scene.background))
+        hidden_share(state.model, views, scene.points, RenderSettings(scene.background)) if is_plain else None
         for views in (scene.train_views, scene.test_views)
     ]
     return {

@@ -177,7 +177,8 @@ def find_recipe(name: str, iterations: int | None = None, *, extension: str | No
     iterations : int, optional
         Length to which it is scaled; the published one by default.
     extension : str, optional
-        An extension to train a recipe of the core with. A recipe of an extension brings its own.
+        An extension to train a recipe of the core with. A recipe of an extension brings its own, and may be trained
+        with another one that has nothing but loss terms.
 
     Raises
     ------
@@ -186,20 +187,21 @@ def find_recipe(name: str, iterations: int | None = None, *, extension: str | No
         extension, or ``iterations`` is below 1.
     """
     recipe, owner = (RECIPES[name], None) if name in RECIPES else _of_extensions(name)
-    if owner is not None and extension not in (None, owner.name):
-        raise InputError(f"recipe {name} belongs to extension {owner.name}: leave out --extension {extension}")
-    if owner is None and extension is not None:
-        owner = load_extension(extension)
+    if extension is not None and (owner is None or owner.name != extension):
+        other = load_extension(extension)
+        if owner is not None and (other.representation != GAUSSIANS or not other.losses):
+            raise InputError(f"recipe {name} belongs to extension {owner.name}: leave out --extension {extension}")
+        recipe = recipe._replace(representation=other.representation, losses=(*recipe.losses, *other.losses))
     if owner is not None:
         recipe = recipe._replace(representation=owner.representation, losses=(*recipe.losses, *owner.losses))
     return recipe if iterations is None else scale_recipe(recipe, iterations)
 
 
 def owner_of(recipe: str, extension: str | None = None) -> Extension | None:
-    """Return the extension that a recipe is trained with, None for the core alone."""
-    if extension is not None:
-        return load_extension(extension)
-    return None if recipe in RECIPES else _of_extensions(recipe)[1]
+    """Return the extension whose population a recipe trains, None for the core alone."""
+    if recipe not in RECIPES:
+        return _of_extensions(recipe)[1]
+    return None if extension is None else load_extension(extension)
 
 
 def _of_extensions(name: str) -> tuple[Recipe, Extension]:

@@ -204,8 +204,8 @@ def test_unknown_names(refused, scene_folder, tmp_path):
 
 
 def test_recipe_of_another_extension(refused, scene_folder, tmp_path):
-    line = refused(*train(scene_folder, tmp_path / "out", "--recipe", "velocity", "--extension", "geometry"))
-    assert "recipe velocity belongs to extension velocity: leave out --extension geometry" in line
+    line = refused(*train(scene_folder, tmp_path / "out", "--recipe", "velocity", "--extension", "surfels"))
+    assert "recipe velocity belongs to extension velocity: leave out --extension surfels" in line
 
 
 def test_an_extension_without_commands(refused):

@@ -11,6 +11,7 @@ from data_tools.claims.kit.claim import FIGURE, RESULT
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import ViewMetrics
 from minisplat_ref.training.recipe_settings import settings_of
@@ -77,6 +78,19 @@ def test_recipes_with_settings():
     assert (settings_of(changed)["min_slope"], settings_of(changed)["max_growth"]) == (0.5, 0.3)
     with pytest.raises(InputError, match="no slope to set"):
         folds.recipe_of("adaptive+slope=1")
+
+
+def test_recipes_of_extensions_and_terms_for_any_recipe():
+    ours = folds.recipe_of("mcmc+budget=700")
+    assert (ours.name, ours.iterations, settings_of(ours)["budget"]) == ("mcmc", 3000, 700)
+    assert ours.representation == load_extension("mcmc").representation
+    for name in ("adaptive", "mini-splatting2", "mcmc"):
+        with_depth = folds.recipe_of(f"{name}+sfm_depth=0.1")
+        assert {term.name: term.weight for term in with_depth.losses}["sfm_depth"] == 0.1
+        assert with_depth.iterations == folds.recipe_of(name).iterations
+    assert "sfm_depth" not in settings_of(folds.recipe_of("adaptive+min_slope=0.5"))
+    with pytest.raises(InputError, match="recipe adaptive has no sfm_dept to set"):
+        folds.recipe_of("adaptive+sfm_dept=0.1")
 
 
 def test_known_pixels_by_hand():
