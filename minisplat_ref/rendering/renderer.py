@@ -96,6 +96,7 @@ def render(
     conventions: Conventions = GSPLAT_MAIN,
     backend: Backend = CPU,
     is_visible: Bools | None = None,
+    opacity_factor: float = 1.0,
     with_depth: bool = False,
     with_stats: bool = False,
     with_median_depth: bool = False,
@@ -118,6 +119,8 @@ def render(
         Implementation of the stages.
     is_visible : ndarray of shape (N,) of booleans, optional
         Rows to render; the others are culled as if they were transparent. All by default.
+    opacity_factor : float
+        Multiplies all opacities, which may exceed 1; alpha is limited as ever.
     with_depth : bool
         Append the accumulated depth, ``sum w z``, as the last channel of the image.
     with_stats, with_median_depth : bool
@@ -151,7 +154,7 @@ def render(
         return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)
 
     splats = splat(
-        activate(gaussians, is_visible),
+        activate(gaussians, is_visible, opacity_factor),
         shade,
         camera,
         background,
@@ -180,7 +183,7 @@ def choose_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
     return stored if wanted is None else np.minimum(wanted, stored)
 
 
-def activate(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
+def activate(gaussians: Any, is_visible: Bools | None = None, opacity_factor: float = 1.0) -> Primitives:
     """Return Gaussians after their activations.
 
     Parameters
@@ -189,12 +192,16 @@ def activate(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
         Or any population that has its first four fields.
     is_visible : ndarray of shape (N,) of booleans, optional
         The opacity of the others is 0.
+    opacity_factor : float
+        Multiplies the opacities.
     """
     dtype = gaussians.means.dtype
     with np.errstate(over="ignore"):
         # The largest number of float32 takes the place of infinity, which times a gradient of zero would be NaN.
         scales = np.minimum(np.exp(gaussians.log_scales), dtype.type(np.finfo(np.float32).max))
         opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
+    if opacity_factor != 1:
+        opacities = opacities * dtype.type(opacity_factor)
     if is_visible is not None:
         opacities = np.where(is_visible, opacities, opacities.dtype.type(0))
     return Primitives(gaussians.means, gaussians.quats, scales, opacities)
@@ -205,12 +212,12 @@ def activate_vjp(
 ) -> tuple[Floats, Floats]:
     """Return the gradients of logarithms of scales [N, 3] and of logits [N] from those of :func:`activate`'s results.
 
-    ::
+    With the sigmoid p of the logit and the opacity ``o = f p``, where f is the factor::
 
-        v_log_s = s v_s,  v_logit = o (1 - o) v_o
+        v_log_s = s v_s,  v_logit = f p (1 - p) v_o = o (1 - p) v_o
     """
     with np.errstate(over="ignore"):
-        transparencies = 1 / (1 + np.exp(opacity_logits))  # 1 - o, without the cancellation of 1 - 0.9999
+        transparencies = 1 / (1 + np.exp(opacity_logits))  # 1 - p, without the cancellation of 1 - 0.9999
     return primitives.scales * v_scales, primitives.opacities * transparencies * v_opacities
 
 
@@ -291,6 +298,8 @@ class Request(NamedTuple):
     backend: Backend = CPU
     is_visible: Bools | None = None
     """[N] rows to render; all by default."""
+    opacity_factor: float = 1.0
+    """Multiplies all opacities, for renderers that do (:attr:`Renderer.scales_opacities`)."""
     behind: Floats | None = None
     """[H, W, 3] light from behind the model, which a wrapping renderer adds to the image; the output's extras include
     it."""
@@ -311,6 +320,8 @@ class Renderer(NamedTuple):
     """``render_vjp(tape, v_image, v_alpha)``: v_image is [H, W, D] with all channels, v_alpha [H, W] or None."""
     channels: Callable[[frozenset[str]], dict[str, slice]]
     """``channels(wants)``: the image's channels by name."""
+    scales_opacities: bool = False
+    """Whether it renders with :attr:`Request.opacity_factor`."""
 
 
 def as_model(model: Any) -> Model:
@@ -337,6 +348,7 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
         conventions=request.conventions,
         backend=request.backend,
         is_visible=request.is_visible,
+        opacity_factor=request.opacity_factor,
         with_depth="depth" in wants,
         with_stats=bool(wants & _OF_STATS),
         with_median_depth="median_depth" in wants,
@@ -380,7 +392,7 @@ def _channels(wants: frozenset[str]) -> dict[str, slice]:
     return {"rgb": slice(0, 3), "depth": slice(3, 4)} if "depth" in wants else {"rgb": slice(0, 3)}
 
 
-SPLATTING = Renderer("splatting", _render_model, render_vjp, _channels)
+SPLATTING = Renderer("splatting", _render_model, render_vjp, _channels, scales_opacities=True)
 """3DGS: any population that has the six fields of :class:`Gaussians`."""
 
 

@@ -41,7 +41,7 @@ def wrap(
     Returns
     -------
     Renderer
-        With the channels of ``inner``.
+        With the channels of ``inner``, and opacities scaled where ``inner`` scales them.
     """
 
     def render_changed(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
@@ -52,4 +52,4 @@ def wrap(
     def render_changed_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
         return change_vjp(tape.record, inner.render_vjp(tape.inner, v_image, v_alpha))
 
-    return Renderer(name, render_changed, render_changed_vjp, inner.channels)
+    return Renderer(name, render_changed, render_changed_vjp, inner.channels, inner.scales_opacities)

@@ -80,6 +80,7 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
             "sh_degree": None if isinstance(degree, np.ndarray) else degree,
             "conventions": request.conventions._asdict(),
             "wants": sorted(request.wants),
+            "opacity_factor": request.opacity_factor,
         },
     }
     save_checkpoint(path, arrays, metadata)
@@ -118,6 +119,7 @@ class SavedCase(NamedTuple):
                 arrays.get("request.sh_degree", request["sh_degree"]),
                 Conventions(**request["conventions"]),
                 is_visible=arrays.get("request.is_visible"),
+                opacity_factor=request.get("opacity_factor", 1.0),  # of a file without it: none
                 wants=frozenset(request["wants"]),
             ),
             recipe,

@@ -25,6 +25,7 @@ from minisplat_ref.rendering import RenderGradient, RenderSettings
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.adam import AdamRule, adam_step, named_fields
 from minisplat_ref.training.case import Case
+from minisplat_ref.training.dropout import leave_out
 from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.losses import Loss, Rendered, total_loss
@@ -103,6 +104,8 @@ def draw_case(state: TrainState, training: Training) -> Case:
         sh_degree=state.stats.get(DEGREES, active_sh_degree(step, recipe.sh_milestones)),
         is_visible=state.stats["is_visible"][:, view_id] if "is_visible" in state.stats else None,
     )
+    if share := recipe.drop_share(step):
+        request = leave_out(request, n_rows(state.gaussians), share, state.rng)
     return Case(step, state.model, view, scene, request, recipe)
 
 

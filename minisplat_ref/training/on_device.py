@@ -228,6 +228,8 @@ def find_obstacle(state: TrainState, recipe: Recipe, step: int) -> str | None:
     """Return the part of an iteration that has no kernels for the device; None if all of it can stay there."""
     if recipe.renderer is not SPLATTING or type(state.gaussians) is not Gaussians:
         return f"the renderer {recipe.renderer.name}"
+    if recipe.dropout:
+        return "dropout"
     if state.shared:
         return f"the shared parameters {', '.join(state.shared)}"
     terms = recipe.due_terms(step)

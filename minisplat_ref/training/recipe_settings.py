@@ -2,8 +2,8 @@
 
 A setting is a keyword argument that ``functools.partial`` has bound to a function of the recipe: an event's action, a
 loss term, or a part of the representation. Its name is the argument's, so that no list of settings is kept anywhere.
-Four more kinds have no function: weights of loss terms, calibrations that are on, the source of the exposures, and
-``starts_densely``.
+Five more kinds have no function: weights of loss terms, calibrations that are on, the source of the exposures,
+``starts_densely`` and ``dropout``.
 """
 
 import inspect
@@ -25,6 +25,8 @@ from minisplat_ref.types import Model
 
 START = "starts_densely"
 """The setting of :attr:`Recipe.starts_densely`."""
+DROPOUT = "dropout"
+"""The setting of :attr:`Recipe.dropout`, a share."""
 DSSIM = "dssim_weight"
 """The setting of :func:`minisplat_ref.training.losses.photometric`, a share."""
 
@@ -64,8 +66,8 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
     parts = recipe.representation
     functions = (parts.extend, parts.shared, parts.renderer.render, parts.from_file)
     representation = [bound_settings(function) for function in functions if function is not None]
-    start = [{START: recipe.starts_densely}]
-    found = [*events, *terms, *source, *switches, *representation, *start]
+    of_recipe = [{START: recipe.starts_densely, DROPOUT: recipe.dropout}]
+    found = [*events, *terms, *source, *switches, *representation, *of_recipe]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
@@ -75,9 +77,14 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
     Raises
     ------
     InputError
-        The recipe has no such setting.
+        The recipe has no such setting, or its renderer cannot leave out Gaussians.
     """
     known = settings_of(recipe)
+    if settings.get(DROPOUT) and not recipe.representation.renderer.scales_opacities:
+        name = recipe.representation.renderer.name
+        raise InputError(
+            f"recipe {recipe.name}: renderer {name} cannot make up for Gaussians that are left out; leave dropout at 0"
+        )
     for name, value in settings.items():
         if name not in known:
             raise InputError(f"recipe {recipe.name} has no {name} to set{suggest(name, sorted(known))}")
@@ -100,6 +107,7 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
             ),
             representation=_configure_representation(recipe.representation, name, value),
             starts_densely=value if name == START else recipe.starts_densely,
+            dropout=value if name == DROPOUT else recipe.dropout,
             exposure=value if is_source else recipe.exposure,
         )
     return _hold_refined_exposures(recipe)
@@ -169,6 +177,8 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     for name in sorted(weights & values.keys()):
         if not 0 <= values[name] < math.inf:
             raise InputError(f"--set {name}={texts[name]}: a weight of the loss is at least 0; 0 leaves the term out")
+    if DROPOUT in values and not 0 <= values[DROPOUT] < 1:
+        raise InputError(f"--set {DROPOUT}={texts[DROPOUT]}: the share that is left out is at least 0 and below 1")
     if DSSIM in values and not 0 <= values[DSSIM] <= 1:
         raise InputError(f"--set {DSSIM}={texts[DSSIM]}: the shares of L1 and D-SSIM are at least 0; give 0 to 1")
     return values

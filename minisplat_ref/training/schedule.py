@@ -15,6 +15,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import CALIBRATIONS, NONE, Calibration
+from minisplat_ref.training.dropout import OPEN_LENGTH, drop_share
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.pace import Cooling, Pace
 from minisplat_ref.training.rates import Rates
@@ -162,6 +163,9 @@ class Recipe(NamedTuple):
     """The population that is trained, and its renderer."""
     starts_densely: bool = False
     """Begin with points from stereo besides the sparse points (:mod:`minisplat_ref.training.dense_start`)."""
+    dropout: float = 0.0
+    """Share of the Gaussians that renderings of the training leave out in the end
+    (:mod:`minisplat_ref.training.dropout`)."""
     exposure: str = NONE
     """Whence the photographs' exposures come, one of :data:`~minisplat_ref.training.calibration.EXPOSURE_SOURCES`."""
     cooling: Cooling | None = None
@@ -196,6 +200,10 @@ class Recipe(NamedTuple):
             return values
         factor, factor_per_extent = self.cooling.factors(step, pace)
         return {name: v * (factor_per_extent if name in rates.per_extent else factor) for name, v in values.items()}
+
+    def drop_share(self, step: int) -> float:
+        """Return the share of the Gaussians that an iteration's rendering leaves out."""
+        return drop_share(self.dropout, step, self.iterations if self.cooling is None else OPEN_LENGTH)
 
     def due_terms(self, step: int) -> list[LossTerm]:
         """Return the terms of an iteration's loss."""
@@ -285,7 +293,8 @@ def _scale_limit(step: int | None, factor: Fraction) -> int | None:
 def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe as numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
-    fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
+    unused = {"cooling", *(() if recipe.dropout else ("dropout",))}
+    fields = {name: value for name, value in recipe._asdict().items() if name not in unused}
     representation = recipe.representation
     renderer_settings = _named_settings(representation.renderer.render)
     role = "extend" if representation.from_file is None else "from_file"

@@ -187,7 +187,9 @@ def with_2d_filter(inner: Renderer) -> Renderer:
         conventions = request.conventions._replace(eps2d=EPS2D, is_antialiased=True)
         return inner.render(model, view, request._replace(conventions=conventions))
 
-    return Renderer(f"{inner.name} with 2D filter", render_blurred, inner.render_vjp, inner.channels)
+    return Renderer(
+        f"{inner.name} with 2D filter", render_blurred, inner.render_vjp, inner.channels, inner.scales_opacities
+    )
 
 
 def measure_filters(state: TrainState, iteration: Iteration, *, variance: float) -> None:

@@ -72,7 +72,7 @@ def prepare(model: Model, camera: Camera, request: Request) -> Prepared:
     g, dtype = model.gaussians, model.gaussians.means.dtype
     degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
-    primitives = activate(g, request.is_visible)
+    primitives = activate(g, request.is_visible, request.opacity_factor)
     footprints = _projection(request.backend).project(primitives, camera, request.conventions)
     channels = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, footprints.radii)
     has_depth = "depth" in request.wants
@@ -161,7 +161,7 @@ def render_through_lens_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None
 
 THROUGH_LENS = Representation(
     "gaussians along the rays of a lens",
-    renderer=Renderer("lens", render_through_lens, render_through_lens_vjp, SPLATTING.channels),
+    renderer=Renderer("lens", render_through_lens, render_through_lens_vjp, SPLATTING.channels, scales_opacities=True),
     takes_optics=True,
     is_inside=are_inside,
 )

@@ -168,7 +168,7 @@ def look(model: Model, view: View, request: Request, low_pass_cutoff: float = RE
         raise InputError(f"surfels are drawn without {names}: train a recipe that does without")
     if request.conventions.is_antialiased:
         raise InputError("surfels have a low-pass without compensated opacities: leave the antialiased profile out")
-    primitives = activate(model.gaussians, request.is_visible)
+    primitives = activate(model.gaussians, request.is_visible, request.opacity_factor)
     rules = RELEASED._replace(low_pass_cutoff=low_pass_cutoff)
     surfels = _projection(request.backend).project(primitives, view.camera, request.conventions, rules)
     return Seen(model.gaussians, primitives, view.camera, surfels)
@@ -323,6 +323,10 @@ def render_surfels_vjp(tape: SurfelTape, v_image: Floats, v_alpha: Floats | None
 
 
 SURFELS = Renderer(
-    "surfels", partial(render_surfels, low_pass_cutoff=RELEASED.low_pass_cutoff), render_surfels_vjp, channels
+    "surfels",
+    partial(render_surfels, low_pass_cutoff=RELEASED.low_pass_cutoff),
+    render_surfels_vjp,
+    channels,
+    scales_opacities=True,
 )
 """2D Gaussian Splatting: any population that has the six fields of :class:`Gaussians`."""
