@@ -35,7 +35,7 @@ from minisplat_ref.types import Floats
 
 # playcanvas/supersplat: src/camera-poses.ts for the entries of a pose, src/camera.ts for the side of its angle
 FOV = 60.0  # degrees, of SuperSplat, where a file has none
-# NVlabs/instant-ngp: nerf_loader.h for the unit cube, camera_path.cu for the entries, testbed.h for the side of the angle
+# NVlabs/instant-ngp: nerf_loader.h for the unit cube, camera_path.cu for the entries, testbed.h for the angle's side
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 NGP_AXES = (1, 2, 0)  # of the scene, which are x, y and z of instant-ngp
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])

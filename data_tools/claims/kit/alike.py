@@ -2,9 +2,10 @@
 
 What two recipes may have besides their mechanism are *conditions*: length, optimiser, learning rates of what both
 train, dates of the harmonics, density control, photometric loss, background, sky and other calibrations, exposures,
-size of the views, dense start. :func:`adopt` gives a relative those of its base, :func:`unlike_conditions` names what
-still differs, and :func:`refuse_unlike` refuses arms that do. A release often changes some of them together with the
-mechanism; then a table has two rows, the mechanism alone and the relative as released, with what differs besides.
+size of the views, dense start, dropout. :func:`adopt` gives a relative those of its base, :func:`unlike_conditions`
+names what still differs, and :func:`refuse_unlike` refuses arms that do. A release often changes some of them together
+with the mechanism; then a table has two rows, the mechanism alone and the relative as released, with what differs
+besides.
 
 A learning rate of zero is no condition: the relative moves that parameter by others.
 """
@@ -39,6 +40,7 @@ _CONDITIONS: dict[str, Callable[[Recipe], Any]] = {
     "exposures": lambda recipe: recipe.exposure,
     "size of the views": lambda recipe: [e for e in recipe.events if isinstance(e, SmallerViews)],
     "dense start": lambda recipe: recipe.starts_densely,
+    "dropout": lambda recipe: recipe.dropout,
 }
 
 
@@ -74,6 +76,7 @@ def adopt(base: Recipe, relative: Recipe, own: Collection[str] = ()) -> Recipe:
         calibrations=base.calibrations,
         exposure=base.exposure,
         starts_densely=base.starts_densely,
+        dropout=base.dropout,
         losses=(*_photometric(base), *(term for term in relative.losses if term not in _photometric(relative))),
     )
     if HARMONICS not in own:

@@ -53,6 +53,7 @@ def test_a_mechanism_is_no_difference():
         ({"sh_milestones": (1, 2, 3)}, HARMONICS),
         ({"has_random_background": True}, "background"),
         ({"starts_densely": True}, "dense start"),
+        ({"dropout": 0.2}, "dropout"),
         ({"exposure": "tracks"}, "exposures"),
         ({"learning_rates": RELATIVE.learning_rates.change(quats=0.5)}, RATES),
         ({"adam": BASE.adam._replace(is_visible_only=not BASE.adam.is_visible_only)}, "optimiser"),
