@@ -41,6 +41,7 @@ HARD = {  # mean, quaternion, scale, opacity
     "on the axis": ((0.0, 0.0, 4.0), (1.0, 0.3, -0.2, 0.1), 0.2, 0.8),
     "beside the axis by a hair": ((1e-9, -1e-9, 4.0), FACING, 0.2, 0.8),
     "behind": ((0.1, 0.0, -3.0), FACING, 0.2, 0.8),
+    "behind and two thirds as large as its distance": ((0.1, 0.0, -3.0), FACING, 0.6, 0.8),
     "obliquely behind": ((2.0, 0.5, -1.0), FACING, 0.2, 0.8),
     "behind on the axis": ((0.0, 0.0, -3.0), FACING, 0.2, 0.8),
     "at the camera": ((0.0, 0.0, 0.0), FACING, 0.2, 0.8),
