@@ -58,7 +58,7 @@ class SfmResult(NamedTuple):
     n_matches: int
     """Verified matches, with which the results were judged."""
     groups: Mapping[Group, list[str]]
-    """Names of the photographs that share a camera."""
+    """Names of the photographs that share a camera; of those told apart by their focal length, the placed ones."""
     n_masks: int
     """Photographs with a mask."""
     sizes: tuple[tuple[int, int], ...]
@@ -145,7 +145,9 @@ def run_sfm(
         kept=best._replace(model=None),
         others=tuple(other._replace(model=None) for other in others),
         n_matches=n_matches,
-        groups=groups,
+        groups={
+            group: [name for name in names if group.found is None or name in placed] for group, names in groups.items()
+        },
         n_masks=len(photographs.masked),
         sizes=tuple((photo.camera.width, photo.camera.height) for photo in written),
         up=upright,
