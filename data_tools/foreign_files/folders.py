@@ -173,7 +173,7 @@ CASES: dict[str, Callable[[Path], None]] = {
     **{
         f"scene refused: {name}": partial(_scene_refused, name=name, content=content, says=says)
         for name, content, says in (
-            ("cameras.xml", METASHAPE, "Export Cameras as COLMAP"),
+            ("cameras.xml", METASHAPE, "File > Export > Export Cameras"),
             ("cams.XML", METASHAPE.replace("?>", "?>\n"), "ns-process-data metashape"),
             ("scene.rcproj", "<RealityCaptureProject/>", "COLMAP there"),
             ("registration.csv", "#name,x,y,alt,heading,pitch,roll\n", "RealityCapture"),

@@ -46,7 +46,7 @@ def _aspect(folder: Path, name: str, ratio: str, size: tuple[int, int]) -> None:
 
 CASES: Mapping[str, Callable[[Path], None]] = {
     **{
-        f"variable rate, {name}": partial(_variable, name=name, times=times)
+        f"video at a variable rate, {name}": partial(_variable, name=name, times=times)
         for name, times in (
             ("dim.mp4", "if(lt(N,4),N,4+5*(N-4))"),
             ("jitter.mov", "N+0.3*sin(3*N)"),
@@ -56,7 +56,7 @@ CASES: Mapping[str, Callable[[Path], None]] = {
         if find_spec("imageio_ffmpeg")
     },
     **{
-        f"pixels of {ratio}": partial(_aspect, name=name, ratio=ratio, size=size)
+        f"video with pixels of {ratio}": partial(_aspect, name=name, ratio=ratio, size=size)
         for name, ratio, size in (
             ("pal.mov", "16/15", (51, 36)),
             ("ntsc.mp4", "10/11", (48, 40)),
