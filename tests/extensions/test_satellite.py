@@ -208,6 +208,26 @@ def test_residual_of_a_perspective_camera():
         perspective(5e3)()
 
 
+def test_a_pixel_is_the_limit_of_a_fit():
+    """From 70 km 353 / 0.3 x 50 / 70,000 = 0.84 pixels are left, and from 50 km 1.18."""
+    assert perspective(70e3)().worst == pytest.approx(0.84, abs=0.01)
+    with pytest.raises(InputError, match=r"leaves 1\.18 pixels"):
+        perspective(50e3)()
+
+
+def test_a_low_sun_shines():
+    """A degree above the horizon it does, 0.03 degrees count as none."""
+    low, set_ = (cameras.sun_direction(10, elevation, 0) for elevation in (1, 0.03))
+    assert sun_slopes(cameras.make_affine_camera(NORTH_UP, np.zeros(2), 1.0, (4, 4), low))[2] == pytest.approx(1)
+    with pytest.raises(InputError, match="horizon"):
+        cameras.make_affine_camera(NORTH_UP, np.zeros(2), 1.0, (4, 4), set_)
+
+
+@pytest.mark.parametrize(("longitude", "zone"), [(-180, 1), (-174.1, 1), (-174, 2), (0, 31), (179.9, 60), (180, 1)])
+def test_zones(longitude, zone):
+    assert cameras.find_zone(longitude) == zone
+
+
 def test_fit_of_an_rpc():
     """An RPC without curvature is affine in degrees; UTM bends it by 0.03 pixels."""
     r = make_rpc()
@@ -446,6 +466,35 @@ def test_folding_changes_no_photograph(setting):
     assert np.abs(state.shared[RADIOMETRY][1] - np.eye(3, 4)).max() > 0.05
     after = [SATELLITE.render(state.model, view, request)[0].image for view in views]
     assert np.abs(np.array(after) - before).max() < 1e-3  # 1 - alpha of 1e-4, and float32
+
+
+def test_a_reference_without_colours_is_not_folded():
+    """A matrix of rank 2 has no inverse: nothing changes, and the log says why."""
+    state = initial_state(boxes.make_scene(0, n_points=4, size=8).scene, find_recipe("satellite", 10), 0)
+    state.shared[RADIOMETRY][0, :, :3] = np.diag([1.0, 1.0, 0.0])
+    before = state.gaussians.sh_dc.copy(), state.shared[RADIOMETRY].copy()
+    assert "cannot be inverted" in fold_reference(state, None)
+    assert np.array_equal(state.gaussians.sh_dc, before[0]) and np.array_equal(state.shared[RADIOMETRY], before[1])
+
+
+def test_what_is_beside_the_image_throws_shadows_into_it(setting):
+    """A tower 10 m high 6 pixels west of an image of 16; the sun in the west at 45 degrees shifts by 8 pixels."""
+    grid = np.stack(np.meshgrid(*[np.linspace(-3, 3, 73)] * 2), axis=-1).reshape(-1, 2)
+    towers = np.abs(grid[:, 0] + 1.75) < 0.2
+    means = np.column_stack([grid, np.where(towers, 10 / boxes.SCALE, 0)])
+    n = len(means)
+    g = setting.gaussians._replace(
+        means=means,
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        log_scales=np.log(np.tile([0.06, 0.06, 0.002], (n, 1))),
+        opacity_logits=np.full(n, 5.0),
+        sh_dc=np.zeros((n, 3)),
+        sh_rest=np.zeros((n, 0, 3)),
+    )
+    camera = boxes.zenith(16)._replace(optics=Optics("affine", (0.0, 48.0, -4.8, 0.0, 1.0)))  # 0.8 pixels a metre
+    request = Request(backend=REFERENCE, wants=frozenset({"shadow"}))
+    shadow = SATELLITE.render(Model(g), view_from(camera), request)[0].image[..., 3]
+    assert shadow[8, 1] < 0.2 and shadow[8, 6] > 0.9  # 10 m are 8 pixels: from -6 to 2
 
 
 def test_loss_terms_by_hand(setting):

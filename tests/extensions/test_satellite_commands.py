@@ -237,6 +237,14 @@ def test_levels_by_hand(monkeypatch):
     assert found.tolist() == [0] + [round(255 * (v - 1) / 198) for v in range(2, 200, 2)] + [255]
 
 
+def test_of_large_images_every_so_many_values_count(monkeypatch):
+    """Of 99 values, of which 10 are taken, every tenth: 0, 10 to 90; half a percent of 90 is 0.45."""
+    values = np.arange(99, dtype=np.uint16).reshape(11, 3, 3)
+    monkeypatch.setattr(reading, "N_SAMPLED", 10)
+    monkeypatch.setattr(reading, "read_pixels", lambda *_: reading.Pixels(values, None))
+    assert reading.find_levels(["x"], None) == pytest.approx((0.45, 89.55))
+
+
 def test_pixels_without_data_do_not_count(monkeypatch):
     values = np.array([[[0.0], [5.0], [np.nan], [7.0]]]).repeat(3, axis=2)
     pixels = reading.Pixels(values, np.array([[False, True, False, True]]))

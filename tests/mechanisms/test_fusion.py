@@ -208,6 +208,7 @@ def test_the_largest_parts_stay():
     kept = keep_largest(mesh, 2)
     assert_array_equal(kept.corners, mesh.corners[[0, 1, 3, 4, 5]])
     assert len(kept.vertices) == len(kept.colors) == 9
+    assert_array_equal(keep_largest(mesh, 1).corners, mesh.corners[3:])
     assert_array_equal(keep_largest(mesh, 9).corners, mesh.corners)
 
 

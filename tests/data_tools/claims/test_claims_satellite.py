@@ -82,6 +82,20 @@ def test_a_tower_stands_in_its_cells(plateau):
     assert np.isnan(wide[:4]).all() and np.isnan(wide[:, -6:]).all() and wide[14, 16] == pytest.approx(6, abs=0.1)
 
 
+@pytest.mark.parametrize(("opacity", "is_surface"), [(0.45, False), (0.55, True)])
+def test_a_surface_hides_half_of_what_is_below(plateau, opacity, is_surface):
+    """A single broad Gaussian: in its middle alpha is its opacity."""
+    model, _ = plateau
+    one = type(model.gaussians)(*(field[:1] for field in model.gaussians))
+    one = one._replace(
+        means=np.array([[0, 0, 0.1]]),
+        log_scales=np.log([[1.0, 1.0, 1e-4]]),
+        opacity_logits=np.array([np.log(opacity / (1 - opacity))]),
+    )
+    heights = surface_model(model._replace(gaussians=one), (25, 25), boxes.SCALE)
+    assert np.isfinite(heights[12, 12]) == is_surface
+
+
 def test_an_arm_lacks_what_its_name_says():
     scene, recipe = boxes.make_scene(0, 4, 8).scene, find_recipe("satellite", 100)
     found = {arm: claims.arm_of(arm, recipe, scene) for arm in claims.ARMS}
