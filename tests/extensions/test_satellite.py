@@ -469,32 +469,44 @@ def test_folding_changes_no_photograph(setting):
 
 
 def test_a_reference_without_colours_is_not_folded():
-    """A matrix of rank 2 has no inverse: nothing changes, and the log says why."""
+    """A matrix that is all but of rank 2 has no inverse to speak of: nothing changes, and the log says why."""
     state = initial_state(boxes.make_scene(0, n_points=4, size=8).scene, find_recipe("satellite", 10), 0)
-    state.shared[RADIOMETRY][0, :, :3] = np.diag([1.0, 1.0, 0.0])
+    state.shared[RADIOMETRY][0, :, :3] = np.diag([1.0, 1.0, 1e-7])
     before = state.gaussians.sh_dc.copy(), state.shared[RADIOMETRY].copy()
     assert "cannot be inverted" in fold_reference(state, None)
     assert np.array_equal(state.gaussians.sh_dc, before[0]) and np.array_equal(state.shared[RADIOMETRY], before[1])
 
 
-def test_what_is_beside_the_image_throws_shadows_into_it(setting):
-    """A tower 10 m high 6 pixels west of an image of 16; the sun in the west at 45 degrees shifts by 8 pixels."""
+def shadow_of_towers(setting, *towers):
+    """The shadow [16, 16] of towers (x, metres) on a plane; the sun in the west at 45 degrees, 8 pixels for 10 m."""
     grid = np.stack(np.meshgrid(*[np.linspace(-3, 3, 73)] * 2), axis=-1).reshape(-1, 2)
-    towers = np.abs(grid[:, 0] + 1.75) < 0.2
-    means = np.column_stack([grid, np.where(towers, 10 / boxes.SCALE, 0)])
-    n = len(means)
+    heights = np.zeros(len(grid))
+    for x, height in towers:
+        heights[np.abs(grid[:, 0] - x) < 0.2] = height / boxes.SCALE
+    n = len(grid)
     g = setting.gaussians._replace(
-        means=means,
+        means=np.column_stack([grid, heights]),
         quats=np.tile([1.0, 0, 0, 0], (n, 1)),
         log_scales=np.log(np.tile([0.06, 0.06, 0.002], (n, 1))),
         opacity_logits=np.full(n, 5.0),
         sh_dc=np.zeros((n, 3)),
         sh_rest=np.zeros((n, 0, 3)),
     )
-    camera = boxes.zenith(16)._replace(optics=Optics("affine", (0.0, 48.0, -4.8, 0.0, 1.0)))  # 0.8 pixels a metre
+    camera = boxes.zenith(16)._replace(optics=Optics("affine", (0.0, 48.0, -4.8, 0.0, 1.0)))
     request = Request(backend=REFERENCE, wants=frozenset({"shadow"}))
-    shadow = SATELLITE.render(Model(g), view_from(camera), request)[0].image[..., 3]
-    assert shadow[8, 1] < 0.2 and shadow[8, 6] > 0.9  # 10 m are 8 pixels: from -6 to 2
+    return SATELLITE.render(Model(g), view_from(camera), request)[0].image[..., 3]
+
+
+def test_what_is_beside_the_image_throws_shadows_into_it(setting):
+    """Of 10 m, 6 pixels west of an image of 16: 8 pixels to the east are 2."""
+    shadow = shadow_of_towers(setting, (-1.75, 10))
+    assert shadow[8, 1] < 0.2 and shadow[8, 6] > 0.9
+
+
+def test_a_roof_at_the_border_is_shaded_by_what_is_higher(setting):
+    """Of 10 m, at pixel 14.5; 8 pixels west of it 20 m. The sun's image has both at 22.5, where the photograph ends."""
+    assert shadow_of_towers(setting, (0.8125, 10))[8, 14] > 0.9
+    assert shadow_of_towers(setting, (0.8125, 10), (-0.1875, 20))[8, 14] < 0.2
 
 
 def test_loss_terms_by_hand(setting):
