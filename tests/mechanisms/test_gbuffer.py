@@ -332,3 +332,35 @@ def test_a_reflected_ray_begins_beyond_its_surface_and_does_not_end(distance, sh
     seen = SimpleNamespace(camera=camera, primitives=disc)
     found = renderer._visibility(surface, output, pixels, seen, Request(conventions=GSPLAT_MAIN, backend=backend))
     assert_allclose(found, [share], atol=CLOSED_FORM)
+
+
+def test_pixels_without_a_surface_or_whose_normals_cancel_are_not_shaded():
+    """Of three pixels the second has two normals that cancel, and the third alpha of less than half the least."""
+    image = np.zeros((1, 3, 7))
+    image[0, :, 6] = -0.5, 0.0, -1e-3
+    output = SimpleNamespace(image=image, alpha=np.array([[0.5, 0.5, 0.4 * GSPLAT_MAIN.alpha_min]]))
+    slices = {"rgb": slice(0, 3), "depth": slice(3, 4), "normal": slice(4, 7)}
+    camera = Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 1.5, 0.5, 3, 1)
+    found = renderer._pixels(output, slices, camera, Request(conventions=GSPLAT_MAIN))
+    assert found.rows.tolist() == [0] and found.lengths.tolist() == [[0.5]]
+
+
+def test_the_first_row_of_the_table_is_of_a_grazing_view():
+    """Of a cosine of 0.001, since the integral divides by it; the row after it is of 1 / 31."""
+    by_row = [reflectance(np.full(1, mu), np.ones(1))[0] for mu in (0.0, 1 / 31)]
+    assert_allclose(by_row, [integrate(np.full(1, mu), 1.0) for mu in (1e-3, 1 / 31)], rtol=1e-9)
+
+
+@pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=lambda backend: backend.name)
+def test_a_hit_hides_no_more_than_alpha_max_and_no_less_than_alpha_min(backend):
+    """Of a disc that is hit in its middle: 1 - alpha_max is left however opaque it is, and all if it is too faint."""
+    limits = GSPLAT_MAIN.alpha_min, GSPLAT_MAIN.alpha_max
+    ray = Rays(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), np.zeros(1), np.full(1, np.inf))
+    left = [
+        transmittances(
+            Primitives(np.array([[0, 0, 2.0]]), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)), np.array([opacity])),
+            *(ray, GSPLAT_MAIN, backend),
+        )[0]
+        for opacity in (1 - 1e-9, 1.01 * limits[0], 0.99 * limits[0])
+    ]
+    assert_allclose(left, [1 - limits[1], 1 - 1.01 * limits[0], 1], rtol=CLOSED_FORM)
