@@ -38,7 +38,8 @@ DEFAULTS: dict[str, Any] = {
 DESCRIPTION = """\
 Train a scene by several recipes, in turn or by workers, and set the results
 side by side. DIR will hold a run folder RECIPE-seedS for each training,
-compare.json, the figures as PNG, and report.html with all of it.
+compare.json, the figures as PNG, the table as table.csv and table.tex, and
+report.html with all of it.
 
 The first recipe is what the others are compared with. With --folds K each is
 trained K times (RECIPE-foldF-seedS), and each photograph is held out once.
@@ -56,6 +57,7 @@ examples:
 INTERRUPTED = 130  # exit code, of a training too
 
 COMPARE, REPORT = "compare.json", "report.html"
+TABLE_CSV, TABLE_TEX = "table.csv", "table.tex"
 PSNR_OVER_TIME, PSNR_OVER_ITERATIONS = "psnr_over_time.png", "psnr_over_iterations.png"
 PSNR_OVER_COUNT, CHAMFER_OVER_ITERATIONS = "psnr_over_count.png", "chamfer_over_iterations.png"
 GALLERY = "gallery.png"
@@ -161,11 +163,12 @@ def _resume(given: dict[str, Any]) -> "Plan":
 
 
 def _report(plan: "Plan", scene: "Scene") -> None:
-    """Write the figures, the page and compare.json, and print the tables."""
+    """Write the figures, the page, the tables and compare.json, and print the tables."""
     from minisplat_ref.app.comparison import figures
     from minisplat_ref.app.comparison.report import fired_title, notes, report_html
     from minisplat_ref.app.comparison.results import collect, to_json
     from minisplat_ref.app.comparison.table import table_cells
+    from minisplat_ref.app.comparison.table_files import csv_table, latex_table
     from minisplat_ref.app.reports.plots import save_png
     from minisplat_ref.app.runs import run_folder
     from minisplat_ref.app.runs.recipe_actions import HEADING, remarks, rows
@@ -180,8 +183,11 @@ def _report(plan: "Plan", scene: "Scene") -> None:
     save_png(figures.gallery(results.crops, plan.recipes), plan.folder / GALLERY)
     (plan.folder / REPORT).write_text(report_html(plan, scene, results), encoding="utf-8")
     run_folder.write_json(plan.folder / COMPARE, to_json(plan, scene, results))
+    title = f"{scene.name}; {results.machine}"
+    (plan.folder / TABLE_CSV).write_text(csv_table(results.recipes), encoding="utf-8", newline="")
+    (plan.folder / TABLE_TEX).write_text(latex_table(results.recipes, title), encoding="utf-8")
     heading, *cells = table_cells(results.recipes)
-    print(f"\n{scene.name}; {results.machine}\n\n{markdown_table(heading, cells)}\n")
+    print(f"\n{title}\n\n{markdown_table(heading, cells)}\n")
     print("\n".join(notes(plan, results)))
     for fired in results.fired:
         print(f"\n{fired_title(fired)}\n\n{markdown_table(HEADING, rows(fired))}")

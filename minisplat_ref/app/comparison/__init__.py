@@ -8,6 +8,7 @@
 :mod:`.crops`             crops of test views for inspection
 :mod:`.results`           all of these together, and compare.json
 :mod:`.table`             mean, deviation and ratio to the first recipe, as text
+:mod:`.table_files`       the table in CSV and LaTeX
 :mod:`.figures`           PSNR over time, iterations and number of Gaussians; the gallery
 :mod:`.report`            report.html
 ========================  ========================================================================

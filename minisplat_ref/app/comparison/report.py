@@ -179,7 +179,7 @@ def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str
         *([] if plan.init is None else [("Starts from", str(plan.init.resolve()))]),
         ("Machine", f"{results.machine}, {os.cpu_count()} cores"),
         ("Program", f"minisplat_ref {__version__}"),
-        ("Files", f"{plan.folder.resolve()}: a folder per run, compare.json, the figures as PNG"),
+        ("Files", f"{plan.folder.resolve()}: a folder per run, compare.json, table.csv, table.tex, the figures as PNG"),
     ]
 
 

@@ -1,6 +1,7 @@
 """``compare``: from the command line to its files, and by hand what its measures, its table and its crops say."""
 
 import contextlib
+import csv
 import io
 import json
 import math
@@ -84,6 +85,8 @@ def test_what_is_in_the_folder(compared):
     assert {path.name for path in folder.iterdir()} == run_folders | FIGURES | {
         "plan.json",
         "compare.json",
+        "table.csv",
+        "table.tex",
         "report.html",
     }
     for recipe, iterations in zip(RECIPE_NAMES, ITERATIONS, strict=True):
@@ -134,6 +137,21 @@ def test_compare_json_says_what_the_runs_say(compared, scene_folder):
     assert second["relative_to_first"]["best_iteration"] is None
     differences = ("psnr", "psnr_exposed", "psnr_corrected", "ssim", "lpips", "best_psnr")
     assert second["error_of_difference"] == dict.fromkeys(differences)  # of one seed
+
+
+def test_table_files_say_what_compare_json_says(compared):
+    folder, printed = compared
+    of_json = {recipe["recipe"]: recipe for recipe in read_json(folder / "compare.json")["recipes"]}
+    with open(folder / "table.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert {row["recipe"] for row in table} == set(RECIPE_NAMES)
+    for row in table:
+        mean = of_json[row["recipe"]]["mean"][row["metric"]]
+        assert row["mean"] == ("" if mean is None else str(mean))
+    latex = (folder / "table.tex").read_text()
+    psnr = next(line for line in printed.splitlines() if line.startswith("| PSNR (dB)")).split("|")[2].strip()
+    assert f"PSNR (dB) & {psnr} &" in latex
+    assert "3dgs & 3dgs-accel" in latex
 
 
 def test_what_fired_is_told(compared):
