@@ -318,9 +318,11 @@ def test_the_command_line(tmp_path):
     write_scene(make_scene("room", supersampling=1, **size), tmp_path / "scene", size)
     out = tmp_path / "run"
     arguments = ["train", str(tmp_path / "scene"), "--recipe", "mcmc", "--iterations", "60", "--budget", "130"]
-    assert main([*arguments, "--set", "scale_reg=0.02", "--out", str(out)]) == 0
+    further = ["--extension", "geometry", "--set", "sfm_depth=0.1", "--set", "scale_reg=0.02"]
+    assert main([*arguments, *further, "--out", str(out)]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["n_gaussians"] == 130
     described = json.loads((out / "config.json").read_text())["recipe"]
-    assert {term["name"]: term["weight"] for term in described["losses"]}["scale_reg"] == 0.02
+    weights = {term["name"]: term["weight"] for term in described["losses"]}
+    assert weights == {"photometric": 1, "opacity_reg": 0.01, "scale_reg": 0.02, "sfm_depth": 0.1}
     assert main(["eval", str(out)]) == 0
