@@ -1,12 +1,14 @@
 """``python -m data_tools.conformance [NAME ...] --out DIR`` runs renderers on the probes and writes table and page."""
 
 import argparse
+import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from data_tools.conformance import judging
 from data_tools.conformance.judging import Verdict, judge, nearest_habits
 from data_tools.conformance.pages import browsing, picture, serving
 from data_tools.conformance.probes import PROBES, write
@@ -74,7 +76,7 @@ def take_pictures(renderer: Renderer, folder: Path, cache: Path) -> dict[str, Fl
         with serving(folder, cache) as address, browsing(folder / "profile") as browser:
             for probe in with_progress(missing, renderer.name, "probes"):
                 try:
-                    request = write(probe, folder)
+                    request = write(probe, folder, renderer.n_more)
                     shown = picture(browser, address, folder, renderer.driver, dict(renderer.imports), request)
                     save(shown, folder / f"{probe.name}.png")
                 except InputError as error:
@@ -94,7 +96,14 @@ def save(image: Floats, path: Path) -> None:
 
 
 def judged(renderer: Renderer, pictures: dict[str, Floats], folder: Path) -> Result:
-    """Judge all pictures by the profile that is nearest to them, and write the figures."""
+    """Judge all pictures by the habits that are nearest to them, and write the figures; those of the same are read."""
+    file = folder / f"{renderer.version}.json"
+    source = (Path(judging.__file__).read_bytes(), *(pictures[name].tobytes() for name in sorted(pictures)))
+    digest = hashlib.sha256(b"".join(source)).hexdigest()
+    known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    if known.get("of") == digest:
+        habits = next(habits for habits in judging.HABITS if habits.name == known["habits"])
+        return Result(renderer, habits, {name: Verdict(**verdict) for name, verdict in known["verdicts"].items()})
     habits = nearest_habits(pictures, BY_NAME)
     verdicts = {}
     for name in with_progress(BY_NAME, f"{renderer.name} by {habits.name}", "probes"):
@@ -102,8 +111,8 @@ def judged(renderer: Renderer, pictures: dict[str, Floats], folder: Path) -> Res
             verdicts[name] = judge(BY_NAME[name], pictures[name], habits)
         else:
             verdicts[name] = Verdict(name, "no picture", "", *(float("nan"),) * 4)
-    figures = {"habits": habits.name, "verdicts": {name: verdict._asdict() for name, verdict in verdicts.items()}}
-    (folder / f"{renderer.version}.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    figures = {"of": digest, "habits": habits.name, "verdicts": {n: v._asdict() for n, v in verdicts.items()}}
+    file.write_text(json.dumps(figures, indent=1), encoding="utf-8")
     return Result(renderer, habits, verdicts)
 
 

@@ -21,6 +21,7 @@ from minisplat_ref.types import Floats, Gaussians
 WIDTH, HEIGHT, FOCAL = 96, 64, 80.0  # px
 BLACK, WHITE, RED = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.0)
 ROUND = (1.0, 0.0, 0.0, 0.0)  # quaternion
+UNSEEN = -5.3  # logit of an opacity of 1.3/255, which loaders do not drop
 TURNED = (0.9, 0.3, -0.2, 0.25)
 
 
@@ -156,12 +157,25 @@ PROBES = (
 )
 
 
-def write(probe: Probe, folder: Path) -> dict[str, Any]:
-    """Write a probe's PLY into a folder, and return the request of the contract."""
+def write(probe: Probe, folder: Path, n_more: int = 0) -> dict[str, Any]:
+    """Write a probe's PLY into a folder, and return the request of the contract.
+
+    ``n_more`` black Gaussians of little opacity are added in a corner, for viewers that need some.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{probe.name}.ply"
-    save_ply(path, probe.gaussians)
+    last = Gaussians._make(field[-1:].copy() for field in probe.gaussians)
     R, t = probe.camera
+    corner = np.array([(1 - probe.centre[0]) / FOCAL, (1 - probe.centre[1]) / FOCAL, 1.0]) * 4.0
+    hidden = last._replace(
+        means=((corner - t) @ R)[None].astype(np.float32),
+        log_scales=np.full((1, 3), -7, np.float32),
+        opacity_logits=np.array([UNSEEN], np.float32),
+        sh_dc=np.full((1, 3), -0.5 / SH_C0, np.float32),
+        sh_rest=0 * last.sh_rest,
+    )
+    rows = [probe.gaussians, *[hidden] * n_more]
+    save_ply(path, Gaussians._make(np.concatenate(fields) for fields in zip(*rows, strict=True)))
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = R, t
     request = {

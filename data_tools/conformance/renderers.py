@@ -37,6 +37,8 @@ class Renderer(NamedTuple):
     """Where the driver finds what it imports."""
     render: Callable[[Probe], Floats] | None = None
     """Returns the picture [H, W, 3] of a probe, for those that are Python."""
+    n_more: int = 0
+    """Gaussians that nobody sees, which it needs beside those of a probe."""
     reason: str = ""
     """Why it is not run, with what was tried."""
 
@@ -94,6 +96,7 @@ RENDERERS = (
                 f"{MODULES}/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js"
             ),
         },
+        n_more=6,
     ),
     Renderer(
         "gsplatjs",

@@ -28,6 +28,9 @@ EXPECTED = {
     ("gsplatjs", "turned"): (SHARP, "agrees", ""),
     ("gsplatjs", "background"): (SHARP, "agrees", ""),
     ("gsplatjs", "disc"): (SHARP, "rule", EMPTY),
+    ("playcanvas", "disc"): (LOWERED, "agrees", ""),
+    ("playcanvas", "equal"): (LOWERED, "agrees", ""),
+    ("playcanvas", "background"): (LOWERED, "agrees", ""),
     ("spark", "tiny"): (COMPENSATED, "agrees", ""),
     ("spark", "beside"): (COMPENSATED, "rule", EMPTY),
 }
@@ -47,11 +50,11 @@ def browser(tmp_path_factory):
         yield opened
 
 
-def show(browser, packages, folder, viewer, probe, **changes):
+def show(browser, packages, folder, viewer, probe, n_more=None, **changes):
     renderer = NAMES[viewer]
     if not (packages / "node_modules" / renderer.packages[0].rpartition("@")[0]).is_dir():
         pytest.skip(f"no {renderer.packages[0]} beside a node_modules/.bin of the PATH")
-    request = write(BY_NAME[probe], folder) | changes
+    request = write(BY_NAME[probe], folder, renderer.n_more if n_more is None else n_more) | changes
     with serving(folder, packages) as address:
         return picture(browser, address, folder, renderer.driver, dict(renderer.imports), request)
 
@@ -63,9 +66,19 @@ def test_a_viewer_shows_what_it_showed(browser, packages, tmp_path, viewer, prob
     assert verdict.result == result and (result == "agrees" or verdict.rule == rule), verdict
 
 
-@pytest.mark.parametrize("viewer", ["gsplatjs"])
+def test_a_single_gaussian_of_gaussian_splats_3d(browser, packages, tmp_path):
+    """Its quad has six indices, of which as many are drawn as there are Gaussians."""
+    alone = show(browser, packages, tmp_path, "mkkellogg", "disc", 0)
+    assert judge(BY_NAME["disc"], alone, CUT).rule == EMPTY
+    assert show(browser, packages, tmp_path, "mkkellogg", "disc", 6)[32, 48, 0] > 0.7
+
+
+@pytest.mark.parametrize("viewer", ["gsplatjs", "playcanvas", "spark"])
 def test_a_wrong_camera_turns_it_red(browser, packages, tmp_path, viewer):
     view = np.eye(4)
     view[0, 3] = 0.05  # one pixel
-    shown = show(browser, packages, tmp_path, viewer, "needle", cam_from_world=view.tolist())
-    assert judge(BY_NAME["needle"], shown, SHARP).result != "agrees"
+    right = show(browser, packages, tmp_path, viewer, "needle")
+    moved = show(browser, packages, tmp_path, viewer, "needle", cam_from_world=view.tolist())
+    assert np.abs(moved[:, 1:] - right[:, :-1]).max() < 8 / 255 < 0.1 < np.abs(moved - right).max()
+    habits = {"gsplatjs": SHARP, "playcanvas": LOWERED, "spark": COMPENSATED}[viewer]
+    assert judge(BY_NAME["needle"], moved, habits).result != "agrees"

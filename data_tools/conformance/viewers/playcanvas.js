@@ -20,7 +20,7 @@ export async function show(request) {
   const eye = new pc.Entity();
   eye.addComponent("camera", {
     clearColor: new pc.Color(...request.background, 1), nearClip: 0.05, farClip: 500, toneMapping: pc.TONEMAP_NONE,
-    gammaCorrection: pc.GAMMA_NONE,
+    gammaCorrection: pc.GAMMA_SRGB,
   });
   app.root.addChild(eye);
   const world = new pc.Mat4().set(Array.from(view(request))).invert();
