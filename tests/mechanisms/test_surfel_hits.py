@@ -10,14 +10,23 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.mechanisms.surfels import ray_kernels, ray_measures
-from minisplat_ref.mechanisms.surfels.projection import GSPLAT, PAPER, RELEASED, cut_disc_boxes, project
+from minisplat_ref.mechanisms.surfels.disagreement import disagree
+from minisplat_ref.mechanisms.surfels.projection import (
+    GSPLAT,
+    PAPER,
+    RELEASED,
+    choose_pivot,
+    cut_disc_boxes,
+    project,
+)
 from minisplat_ref.mechanisms.surfels.renderer import CHANNELS, SURFELS, list_tiles
 from minisplat_ref.mechanisms.surfels.response import Layout, surfel_response
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request, activate
 from minisplat_ref.rendering.backends import CPU, REFERENCE
-from minisplat_ref.types import Camera, Gaussians, Model, Primitives, view_from
+from minisplat_ref.training.losses import Rendered
+from minisplat_ref.types import Camera, Gaussians, Model, Primitives, RenderOutput, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import (
     CLOSED_FORM,
@@ -336,3 +345,57 @@ def test_what_a_removal_changes_is_what_is_missing_without_it(backend, rng):
     lit, dark = (image.image + (1 - image.alpha[..., None]) * behind for image in (output, without))
     assert_allclose(changes[n], np.sum((lit - dark) ** 2), rtol=REMOVAL)
     assert changes[n] > 0.1
+
+
+# --- rules of the projection, by hand ---
+
+
+def projected(scales, opacity=0.5, quat=(1.0, 0, 0, 0), mean=(0.0, 0, 2.0), **settings):
+    """One disc, which looks at the camera by default; at depth 2 a unit is 16 x 15 pixels."""
+    disc = Primitives(np.array([mean]), np.array([quat]), np.array([[*scales, 1.0]]), np.full(1, opacity))
+    return project(disc, CAMERA, GSPLAT_MAIN, **settings)
+
+
+def test_gsplat_s_radii_are_3_33_deviations_rounded_up():
+    """Of 0.12 units 1.92 and 1.8 pixels, so 6.39 and 5.99: the radii are 7 and 6."""
+    assert projected((0.12, 0.12), rules=GSPLAT).radii.tolist() == [[7, 6]]
+
+
+@pytest.mark.parametrize(("clip", "is_kept"), [(2.0, True), (21.9, True), (22.0, False)])
+def test_a_radius_above_the_clip_is_enough(clip, is_kept):
+    """The radii of 0.4 x 0.01 units, 6.4 x 0.15 pixels, are 22 and 1."""
+    found = projected((0.4, 0.01), rules=GSPLAT, radius_clip=clip)
+    assert found.radii.any() == is_kept
+    assert not is_kept or found.radii.tolist() == [[22, 1]]
+
+
+@pytest.mark.parametrize(("factor", "is_seen"), [(0.99, False), (1.01, True)])
+def test_what_is_fainter_than_alpha_min_is_not_listed(factor, is_seen):
+    assert projected((0.5, 0.5), opacity=factor * GSPLAT_MAIN.alpha_min).radii.any() == is_seen
+
+
+def test_the_pivot_is_the_median_inverse_depth_in_three_bits():
+    """0.3 is 0.6 x 2^-1, of which 5 / 8 x 2^-1 is the nearest."""
+    assert choose_pivot(1 / np.array([0.01, 0.3, 7.0])) == 0.3125
+    assert choose_pivot(np.zeros(0)) == 0
+
+
+def test_a_disc_that_reaches_behind_the_camera_has_its_low_pass_at_its_centre():
+    """By 60 degrees about y, 3 x 2 x sin 60 is more than its depth of 3; of a tenth of the size it is not."""
+    quat, mean = (np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6), 0.0), (0.5, 0.0, 3.0)
+    center = [32 * 0.5 / 3 + 12.3, 9.1]
+    large, small = (projected((scale, scale), quat=quat, mean=mean).means2d[0] for scale in (2.0, 0.2))
+    assert_allclose(large, center, rtol=CLOSED_FORM)
+    assert abs(small[0] - center[0]) > 0.1
+
+
+@pytest.mark.parametrize(("alpha", "counts"), [(0.02, True), (0.4 * GSPLAT_MAIN.alpha_min, False)])
+def test_faint_pixels_have_a_normal_and_pixels_without_hits_have_none(alpha, counts):
+    """A plane at depth 2 that all pixels show as faintly; in the middle of 3 x 3 is the only normal of depths."""
+    camera = Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 1.5, 1.5, 3, 3)
+    normals = np.broadcast_to([0.0, 0.0, -alpha], (3, 3, 3))
+    output = RenderOutput(normals, np.full((3, 3), alpha), None, None)
+    request = Request(conventions=GSPLAT_MAIN)
+    rendered = Rendered(output, {"normal": slice(0, 3)}, view_from(camera), None, None, 1, request)
+    found = disagree(rendered, np.full((3, 3), 2.0))
+    assert found.value == pytest.approx(alpha - alpha * counts / 9)
