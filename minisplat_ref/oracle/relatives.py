@@ -20,11 +20,12 @@ from minisplat_ref.oracle.gradients import by_backend
 from minisplat_ref.oracle.loss_terms import loss_cases, own_terms, stage_name
 from minisplat_ref.oracle.models import TIME, Stages, model_cases
 from minisplat_ref.oracle.pieces import SEED
+from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.types import Floats, Scene
+from minisplat_ref.types import Floats, Gaussians, Scene
 
 
 class Relative(NamedTuple):
@@ -81,7 +82,9 @@ def _cases(backend: Backend, conventions: Conventions, relative: Relative) -> li
 
 
 def _own_representation(relative: Relative) -> Representation | None:
-    return None if relative.representation == GAUSSIANS else relative.representation
+    """Return the representation whose renderer is checked; None where that is 3DGS, however its Gaussians begin."""
+    own = relative.representation
+    return None if (own.population, own.renderer) == (Gaussians, SPLATTING) else own
 
 
 def _add_calibrations(representation: Representation, recipe: Recipe) -> Representation:

@@ -326,3 +326,10 @@ def test_the_command_line(tmp_path):
     weights = {term["name"]: term["weight"] for term in described["losses"]}
     assert weights == {"photometric": 1, "opacity_reg": 0.01, "scale_reg": 0.02, "sfm_depth": 0.1}
     assert main(["eval", str(out)]) == 0
+
+
+def test_the_oracle_checks_the_regularisers_and_that_alone(capsys):
+    """3DGS renders these Gaussians; in the oracle's scene those that begin small would be all but invisible."""
+    assert main(["oracle", "gradients", "--extension", "mcmc", "--backend", "reference"]) == 0
+    printed = capsys.readouterr().out
+    assert "opacity_reg: Jacobian" in printed and "scale_reg: inner" in printed and "render" not in printed
