@@ -25,7 +25,8 @@ profile has: Gaussians cut off at the square root of 8 deviations, or lowered to
 of 8 bits agrees if no pixel is more than {levels} levels (of 255) off, and {more} more for each hit, which a buffer of
 8 bits rounds; pixels at the cut are not compared. Where it differs, each planted fault of the oracle is tried, and one
 that leaves no more is the rule in which it differs. The rest is unexplained: no single rule makes that picture. That is
-not yet to say that it is wrong.
+not yet to say that it is wrong. Two errors were confirmed by hand and in the source: of
+[gsplat.js](conformance/gsplatjs.md) and of [GaussianSplats3D](conformance/gaussian-splats-3d.md).
 
 """
 
