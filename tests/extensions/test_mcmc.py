@@ -12,6 +12,7 @@ from scipy.special import comb, expit
 from actions import act, scene_of, state_of
 from gradcheck import check_jacobian
 from minisplat_ref.app.cli import main
+from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe
@@ -27,6 +28,8 @@ from minisplat_ref.extensions.mcmc.model import (
     share_among_copies,
 )
 from minisplat_ref.extensions.mcmc.recipe import add_copies, add_noise, relocate
+from minisplat_ref.io import load_scene
+from minisplat_ref.io.ply import load_ply
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import render
 from minisplat_ref.rendering.backends import REFERENCE
@@ -326,6 +329,17 @@ def test_the_command_line(tmp_path):
     weights = {term["name"]: term["weight"] for term in described["losses"]}
     assert weights == {"photometric": 1, "opacity_reg": 0.01, "scale_reg": 0.02, "sfm_depth": 0.1}
     assert main(["eval", str(out)]) == 0
+
+
+def test_a_model_of_3dgs_is_continued_as_it_is(tmp_path):
+    """Points begin small and half opaque; what a run has trained does not begin again."""
+    size = {"n_views": 4, "width": 24, "height": 18, "n_points": 60}
+    write_scene(make_scene("room", supersampling=1, **size), tmp_path / "scene", size)
+    run = tmp_path / "run"
+    assert main(["train", str(tmp_path / "scene"), "--recipe", "3dgs", "--iterations", "2", "--out", str(run)]) == 0
+    ours = make_start(run, load_scene(tmp_path / "scene"), find_recipe("mcmc"), seed=0).state.gaussians
+    for name, field in load_ply(run / "point_cloud.ply")._asdict().items():
+        assert_array_equal(getattr(ours, name), field)
 
 
 def test_the_oracle_checks_the_regularisers_and_that_alone(capsys):

@@ -13,11 +13,13 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.frames import place_points
 from minisplat_ref.io.ply import MEANS, NORMALS, load_points
 from minisplat_ref.io.ply_file import property_names
+from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, are_seen
 from minisplat_ref.strategy.ops import contiguous, n_rows
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.calibration import EXPOSURE, LEARNED
 from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Model, Scene
@@ -72,8 +74,9 @@ def make_start(path: str | Path | None, scene: Scene, recipe: Recipe, seed: int)
 def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Start:
     """Return the start of a training from the model of a run, which may have another recipe and another renderer.
 
-    The Gaussians of 3DGS become the recipe's population as those of the scene's points would. Only the model of the run
-    is continued: moments, statistics and the order of the views begin afresh.
+    The Gaussians of 3DGS become the recipe's population as those of the scene's points would, unless the recipe trains
+    and renders them as they are. Only the model of the run is continued: moments, statistics and the order of the views
+    begin afresh.
 
     Parameters
     ----------
@@ -101,7 +104,7 @@ def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
         )
     state = initial_state(scene, recipe, seed)
     rng = np.random.default_rng(seed)
-    state.gaussians = contiguous(_convert_population(folder, model, owner.representation.name, recipe, rng))
+    state.gaussians = contiguous(_convert_population(folder, model, owner.representation, recipe, rng))
     state.adam = zero_moments(state.gaussians)
     _check_shared(folder, model, state, recipe)
     state.shared = {name: np.array(model.shared.get(name, first)) for name, first in state.shared.items()}
@@ -115,16 +118,19 @@ def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
     return Start(state, source if theirs_name == our_name else f"{source}, here by {our_name}", notices)
 
 
-def _convert_population(folder: Path, model: Model, name: str, recipe: Recipe, rng: np.random.Generator) -> Any:
+def _convert_population(
+    folder: Path, model: Model, theirs: Representation, recipe: Recipe, rng: np.random.Generator
+) -> Any:
     """Return a model's primitives as the recipe's population.
 
     Raises
     ------
     InputError
-        They are of another kind, ``name``, that has fields which the recipe does not train.
+        They are of another kind that has fields which the recipe does not train.
     """
-    wanted = recipe.representation
-    if wanted.name == name and name not in wanted.extends:
+    wanted, name = recipe.representation, theirs.name
+    is_same = wanted.name == name or (_is_plain(wanted) and _is_plain(theirs))
+    if is_same and name not in wanted.extends:
         return model.gaussians
     if type(model.gaussians) is Gaussians or name in wanted.extends:
         return wanted.extend(model.gaussians, rng)
@@ -133,6 +139,11 @@ def _convert_population(folder: Path, model: Model, name: str, recipe: Recipe, r
         f"{folder} holds {name} with {further or 'other fields'}, which recipe {recipe.name} does not train: take a"
         f" recipe of its extension, or give --init {folder / POINT_CLOUD} to start from its points alone"
     )
+
+
+def _is_plain(representation: Representation) -> bool:
+    """Return whether Gaussians of 3DGS are trained and rendered as 3DGS does it, however they begin."""
+    return (representation.population, representation.renderer) == (Gaussians, SPLATTING)
 
 
 def _check_shared(folder: Path, model: Model, state: TrainState, recipe: Recipe) -> None:
