@@ -158,7 +158,7 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return settings for :func:`configure`, parsed from text to the types of their present values.
 
     The text for a function is its name, such as ``metric=outdoor``; see :func:`find_alternatives`. Strings, such as the
-    path of a folder, stay as they are. ``none`` is None, except for a weight of a loss term.
+    path of a folder, stay as they are. ``none`` is None, except for a weight of a loss term and for shares.
 
     Raises
     ------
@@ -173,7 +173,8 @@ def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     weights = {term.name for term in recipe.losses}
     if texts.get(EXPOSURE.name, TRACKS) not in EXPOSURE_SOURCES:
         raise InputError(f"--set exposure={texts[EXPOSURE.name]}: choose from {', '.join(EXPOSURE_SOURCES)}")
-    values = {name: _parse(name, text, known[name], name not in weights) for name, text in texts.items()}
+    numbers = weights | {DSSIM, DROPOUT}
+    values = {name: _parse(name, text, known[name], name not in numbers) for name, text in texts.items()}
     for name in sorted(weights & values.keys()):
         if not 0 <= values[name] < math.inf:
             raise InputError(f"--set {name}={texts[name]}: a weight of the loss is at least 0; 0 leaves the term out")

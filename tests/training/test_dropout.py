@@ -197,6 +197,12 @@ def test_shares_beyond_0_and_1_are_refused(text):
         parse_settings(get_recipe("3dgs"), {"dropout": text})
 
 
+@pytest.mark.parametrize("name", ["dropout", "dssim_weight"])
+def test_a_share_is_a_number(name):
+    with pytest.raises(InputError, match=f"--set {name}=none is not a number"):
+        parse_settings(get_recipe("3dgs"), {name: "none"})
+
+
 def test_a_renderer_that_cannot_is_refused_by_name():
     recipe = find_recipe("rays")
     assert configure(recipe, dropout=0.0) == recipe
