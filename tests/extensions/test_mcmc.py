@@ -15,6 +15,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs.start import make_start
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.mcmc.model import (
     COPIES_MAX,
@@ -279,6 +280,13 @@ def test_it_starts_small_and_half_opaque():
     assert_allclose(expit(ours.opacity_logits), 0.5)
     assert_allclose(np.exp(ours.log_scales - plain.log_scales), 0.1, rtol=1e-5)
     assert_array_equal(ours.means, plain.means)
+
+
+@pytest.mark.parametrize("settings", [{"initial_opacity": 1.0}, {"initial_opacity": 0.0}, {"initial_size": 0.0}])
+def test_a_start_without_a_logarithm_is_refused(settings):
+    scene = make_scene("room", n_views=3, width=16, height=12, supersampling=1, n_points=50).scene
+    with pytest.raises(InputError, match="give an opacity between 0 and 1, and a size above 0"):
+        initial_state(scene, configure(find_recipe("mcmc"), **settings), 0)
 
 
 # --- whole trainings ---

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit, logit
 
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.mcmc.model import (
     draw_noise,
     mean_opacity,
@@ -26,7 +27,18 @@ from minisplat_ref.types import Floats, Gaussians, Ints
 def begin_small(
     gaussians: Gaussians, rng: np.random.Generator, *, initial_opacity: float, initial_size: float
 ) -> Gaussians:
-    """Return Gaussians with another opacity, and with their sizes multiplied by ``initial_size``."""
+    """Return Gaussians with another opacity, and with their sizes multiplied by ``initial_size``.
+
+    Raises
+    ------
+    InputError
+        The opacity is not between 0 and 1, or the size not above 0.
+    """
+    if not (0 < initial_opacity < 1 and 0 < initial_size < np.inf):
+        raise InputError(
+            f"mcmc begins with initial_opacity={initial_opacity} and initial_size={initial_size}: give an opacity"
+            " between 0 and 1, and a size above 0"
+        )
     dtype = gaussians.log_scales.dtype
     return gaussians._replace(
         opacity_logits=np.full_like(gaussians.opacity_logits, logit(initial_opacity)),
