@@ -13,6 +13,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.cli import photos as photos_command
 from minisplat_ref.app.runs import next_steps
 from minisplat_ref.app.runs.proposed_size import comfortable_factor
+from minisplat_ref.io import write_image
 from run_commands import interrupt_at, write_room
 from textured_world import HEIGHT, WIDTH, take_photographs, write_photographs
 
@@ -108,7 +109,11 @@ def test_a_folder_that_is_not_there(tmp_path, capsys):
 def test_results_are_named_after_the_folder_or_the_video(name, folder, tmp_path, monkeypatch):
     """The point in a folder's name begins no suffix."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / name).write_bytes(b"") if name.endswith(".mp4") else (tmp_path / name).mkdir()
+    if name.endswith(".mp4"):
+        (tmp_path / name).write_bytes(b"")
+    else:
+        (tmp_path / name).mkdir()
+        write_image(tmp_path / name / "a.png", np.zeros((30, 40, 3), np.uint8))
     asked = []
     monkeypatch.setattr(photos_command, "do", lambda *words: asked.append(words) or 1)
     assert main(["photos", name, "--downscale", "1"]) == 1
