@@ -82,7 +82,7 @@ def test_all_stages_are_exchanged_at_once(folder, capsys):
         ("background=cube", "background=cube names no function: choose from ball, harmonics, nothing, sky_map"),
         ("density=grow", "density=grow names no function: choose from clones, fixed, halves"),
         ("representation=points", "representation=points names no function: choose from gaussians, surfels"),
-        ("sky=true", "recipe gaustudio has no sky to set: choose from .*background"),
+        ("sky=true", "recipe gaustudio has no sky to set; did you mean sky_mask"),
         ("sky_mask=from_files", "sky_mask=from_files has no folder to read: add --set mask_folder=DIR"),
     ],
 )
