@@ -324,7 +324,7 @@ def test_what_tells_the_two_recipes_apart():
 
 
 def test_bad_input():
-    with pytest.raises(InputError, match="'4dgs' does not exist: choose from 3dgs, 3dgs-accel"):
+    with pytest.raises(InputError, match="recipe '4dgs' does not exist; did you mean 3dgs"):
         get_recipe("4dgs")
     with pytest.raises(InputError, match="iterations is 0"):
         get_recipe("3dgs", 0)

@@ -78,4 +78,4 @@ def test_a_wrong_one_fails_with_the_stage_and_what_it_looks_like(repository):
     done = repository(1.01, "-k", "sh3")
     assert done.returncode == 1 and "1 failed" in done.stdout
     assert "the first stage that diverges is image, in scene sh3" in done.stdout
-    assert re.search(r"image, .* wrong and .* right: as with", done.stdout) and "  1. " in done.stdout
+    assert re.search(r"image, .* wrong and .* right: ", done.stdout) and "  1. colours times 1.01" in done.stdout

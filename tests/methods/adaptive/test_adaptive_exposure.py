@@ -164,5 +164,5 @@ def test_the_default_recipe_says_so(tmp_path):
         decisions = json.loads((tmp_path / out / "decisions.json").read_text())
         assert [each["what"] for each in decisions["decisions"] if each["step"] == 0] == whats
         report = (tmp_path / out / "report.html").read_text()
-        assert ("Before the first iteration each photograph got its own exposure" in report) == bool(whats)
+        assert ("exposures: each photograph got its own exposure" in report) == bool(whats)
     assert get_recipe("adaptive", 24).exposure == "refined"
