@@ -120,8 +120,8 @@ def test_a_shape_of_its_own_is_a_difference():
 
 @pytest.fixture
 def guide(tmp_path, monkeypatch):
-    """Return a function that makes an extension of the guide's last example, with one piece of its text replaced."""
-    text = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[-1]
+    """Return a function that makes an extension of the guide's first example, with one piece of its text replaced."""
+    (text,) = (block for block in re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL) if "v_logits = power" in block)
     folder = tmp_path / "mine" / "faint"
     folder.mkdir(parents=True)
     monkeypatch.setattr(extensions, "__path__", [*extensions.__path__, str(folder.parent)])
