@@ -120,9 +120,9 @@ def test_a_shape_of_its_own_is_a_difference():
 
 @pytest.fixture
 def guide(tmp_path, monkeypatch):
-    """Return a function that makes an extension of the guide's first example, with one piece of its text replaced."""
-    (text,) = (block for block in re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL) if "v_logits = power" in block)
-    folder = tmp_path / "mine" / "faint"
+    """Return a function that makes an extension of the guide's last example, with one piece of its text replaced."""
+    text = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[-1]
+    folder = tmp_path / "mine" / "round"
     folder.mkdir(parents=True)
     monkeypatch.setattr(extensions, "__path__", [*extensions.__path__, str(folder.parent)])
 
@@ -132,16 +132,18 @@ def guide(tmp_path, monkeypatch):
         importlib.invalidate_caches()
 
     yield make
-    sys.modules.pop("minisplat_ref.extensions.faint", None)
+    sys.modules.pop("minisplat_ref.extensions.round", None)
 
 
 @pytest.mark.parametrize("factor", [1, 7])
 def test_the_guides_example(guide, factor, capsys):
-    guide("v_logits = power", f"v_logits = {factor} * power")
-    code, output = proof(capsys, "faint")
-    n = 2 * len(BACKENDS)
-    assert code == (factor != 1) and f"{'all' if factor == 1 else n} {'' if factor == 1 else 'of '}{n} cases" in output
-    assert output.count("d loss / d opacity_logits is wrong") == (0 if factor == 1 else len(BACKENDS))
+    """On each backend a Jacobian and inner products; where both are wrong, on compiled ones as on the reference."""
+    guide("log_scales.sum(axis=1)", f"{factor} * log_scales.sum(axis=1)")
+    code, output = proof(capsys, "round")
+    n = 3 * len(BACKENDS) - 1
+    n_wrong = 0 if factor == 1 else 2 * len(BACKENDS)
+    assert code == (factor != 1) and (f"{n_wrong} of {n} cases" if n_wrong else f"all {n} cases") in output
+    assert output.count("d image / d log_radii is wrong") == (0 if factor == 1 else len(BACKENDS))
 
 
 def test_a_term_of_a_recipe_is_checked(monkeypatch, capsys):
