@@ -25,6 +25,7 @@ from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io import images as images_module
 from minisplat_ref.io import load_ply, load_scene, read_image
 from minisplat_ref.io.images import PIXELS_MAX, image_size, is_turned, write_image
+from minisplat_ref.io.upright import Up
 from minisplat_ref.types import Model
 from photo_scenes import HEIGHT, WIDTH, colored_image, write_colmap, write_transforms
 
@@ -251,9 +252,10 @@ RESULT = sfm.SfmResult(
     kept=Mapped("global", "dense", None, 8, 1234, (4, 3), 990),
     others=(Mapped("incremental", "standard", None, 5, 800, (2,), 500), Mapped("global", "standard", None, 0, 0, ())),
     n_matches=1000,
-    groups={GROUP: 9, Group(768, 1024, "", None, None): 6},
+    groups={GROUP: [f"{i}.jpg" for i in range(9)], Group(768, 1024, "", None, None): list("abcdef")},
     n_masks=2,
     sizes=((1600, 1200),) * 7 + ((1200, 1600),),
+    up=Up(np.array([0.0, 0.0, 1.0]), "the plane of the ground among the points"),
 )
 
 
@@ -262,7 +264,7 @@ def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: RESULT)
     monkeypatch.setattr(sfm_command, "_describe_exposures", lambda out: f"exposures of {out}")
     assert main(["sfm", "photos", "--out", "my scene"]) == 0
-    *lines, advice, cameras, masks, exposures, sizes, following = capsys.readouterr().out.splitlines()
+    *lines, advice, cameras, masks, up, exposures, sizes, following = capsys.readouterr().out.splitlines()
     assert lines == [
         "my scene: 8 of 15 photographs (53%), 1234 points, reprojection error 0.50 px",
         "kept: global mapper with dense features: 8 photographs, 1234 points; explains 99% of the matches",
@@ -277,6 +279,7 @@ def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
         " 6 of 768 x 1024"
     )
     assert masks == "masks: of 2 photographs; no features were looked for where they are black"
+    assert up == "up is 0.00,0.00,1.00, by the plane of the ground among the points (--up says it otherwise)"
     assert exposures == "exposures of my scene"
     assert sizes == (
         "photographs of 1600 x 1200 (7 of them) and 1200 x 1600 (1 of them) pixels; begin at 533 x 400, which a laptop"
@@ -288,11 +291,13 @@ def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
 
 
 def test_summary_names_only_what_is_there(tmp_path, capsys, monkeypatch):
-    plain = RESULT._replace(left_out=(), groups={GROUP: 15}, n_masks=0, sizes=((480, 320),) * 15)
+    plain = RESULT._replace(
+        left_out=(), groups={GROUP: [f"{i}.jpg" for i in range(15)]}, n_masks=0, sizes=((480, 320),) * 15
+    )
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: plain)
     monkeypatch.setattr(sfm_command, "_describe_exposures", lambda out: "exposures")
     assert main(["sfm", "photos", "--out", str(tmp_path / "scene")]) == 0
-    first, kept, *others, _, sizes, following = capsys.readouterr().out.splitlines()
+    first, kept, *others, _, _, sizes, following = capsys.readouterr().out.splitlines()
     assert ": 15 of 15 photographs (100%), " in first
     assert kept.startswith("kept: ") and len(others) == 2
     assert sizes == "photographs of 480 x 320 pixels"
