@@ -259,12 +259,17 @@ RESULT = sfm.SfmResult(
 )
 
 
+def printed(capsys):
+    """Return the lines but for one that depends on the PATH."""
+    return [line for line in capsys.readouterr().out.splitlines() if not line.startswith("in a new terminal")]
+
+
 def test_summary_of_a_scene_from_photographs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: RESULT)
     monkeypatch.setattr(sfm_command, "_describe_exposures", lambda out: f"exposures of {out}")
     assert main(["sfm", "photos", "--out", "my scene"]) == 0
-    *lines, advice, cameras, masks, up, exposures, sizes, following = capsys.readouterr().out.splitlines()
+    *lines, advice, cameras, masks, up, exposures, sizes, following = printed(capsys)
     assert lines == [
         "my scene: 8 of 15 photographs (53%), 1234 points, reprojection error 0.50 px",
         "kept: global mapper with dense features: 8 photographs, 1234 points; explains 99% of the matches",
@@ -297,7 +302,7 @@ def test_summary_names_only_what_is_there(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: plain)
     monkeypatch.setattr(sfm_command, "_describe_exposures", lambda out: "exposures")
     assert main(["sfm", "photos", "--out", str(tmp_path / "scene")]) == 0
-    first, kept, *others, _, _, sizes, following = capsys.readouterr().out.splitlines()
+    first, kept, *others, _, _, sizes, following = printed(capsys)
     assert ": 15 of 15 photographs (100%), " in first
     assert kept.startswith("kept: ") and len(others) == 2
     assert sizes == "photographs of 480 x 320 pixels"
