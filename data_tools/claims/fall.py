@@ -17,7 +17,17 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.ablation.variants import FULL, MECHANISMS, variants_of
 from data_tools.claims.folds import Fold, all_photographs, make_fold, read_small
-from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_OUT, SEEDS, argument, declare, iterations, number
+from data_tools.claims.kit.claim import (
+    CONTINUES,
+    LONG_SIDE,
+    NAMES,
+    RESUMED_OUT,
+    SEEDS,
+    argument,
+    declare,
+    folds,
+    iterations,
+)
 from data_tools.claims.kit.claim import recipe as recipe_argument
 from data_tools.claims.kit.figures import standard_error, subplots
 from minisplat_ref.interface.palette import SERIES
@@ -143,10 +153,10 @@ CLAIMS = (
         RESUMED_OUT,
         recipe_argument("mini-splatting2"),
         iterations(3000),
-        number("--folds", 3, "held out is every K-th photograph", minimum=2, metavar="K"),
+        folds(3),
         argument("--thinned", action="store_true", help="take about ten of the photographs"),
         argument("--arms", type=NAMES, metavar="A,B", help="only these mechanisms, or 'exposures' (default: all)"),
-        number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
+        LONG_SIDE,
         SEEDS,
         description="Train with and without each mechanism, and measure held-out photographs on the way. " + CONTINUES,
     ),

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.adaptive import ITERATIONS, warm_up
-from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_OUT, SEEDS, argument, declare, number
+from data_tools.claims.kit.claim import CONTINUES, LONG_SIDE, NAMES, RESUMED_OUT, SEEDS, argument, declare, folds
 from data_tools.claims.kit.coverage import count_covering_views
 from data_tools.claims.kit.figures import standard_error, subplots
 from minisplat_ref.errors import InputError, InputWarning, one_line
@@ -387,7 +387,7 @@ CLAIMS = (
         run,
         argument("scenes", nargs="+", metavar="SCENE", help="folders of scenes, or synthetic ones"),
         RESUMED_OUT,
-        number("--folds", 4, "held out is every K-th photograph", minimum=2, metavar="K"),
+        folds(4),
         argument(
             "--recipes",
             type=NAMES,
@@ -403,7 +403,7 @@ CLAIMS = (
             metavar="P",
             help="whole: all photographs (default); thinned: about ten; both",
         ),
-        number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
+        LONG_SIDE,
         SEEDS,
         description="Hold out each photograph once, train recipes on the others, and measure. " + CONTINUES,
     ),

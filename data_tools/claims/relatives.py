@@ -21,17 +21,17 @@ from data_tools.claims.kit.alike import DENSITY_CONTROL, HARMONICS, RATES, adopt
 from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_SCENE, SEEDS, argument, declare, iterations
 from data_tools.claims.kit.figures import bars
 from data_tools.claims.kit.tables import first, spread, table
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.arguments import name
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
-from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.track_gains import store_gains
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.initial_state import begin_with, initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.recipe_settings import configure_by_name, match_calibrations
+from minisplat_ref.training.representation import convert_population
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Model, Scene
@@ -123,7 +123,7 @@ def outcome(scene: Scene, recipe: Recipe, before: Recipe | None, seed: int) -> d
     """Train an arm, and return the measures of its test views; the seconds are those of the arm alone."""
     state = None
     if before is not None:
-        state = continued(train(scene, before, seed=seed).model, scene, recipe, seed)
+        state = continued(train(scene, before, seed=seed).model, before, scene, recipe, seed)
     start = time.process_time()
     model = train(scene, recipe, seed=seed, state=state).model
     seconds = time.process_time() - start
@@ -139,12 +139,20 @@ def outcome(scene: Scene, recipe: Recipe, before: Recipe | None, seed: int) -> d
     }
 
 
-def continued(model: Model, scene: Scene, recipe: Recipe, seed: int) -> TrainState:
-    """Return the state before the first iteration of a recipe that continues a model of another one."""
-    state = initial_state(scene, recipe, seed)
-    state.gaussians = contiguous(recipe.representation.extend(model.gaussians, np.random.default_rng(seed)))
-    state.adam = zero_moments(state.gaussians)
-    state.shared = {key: np.array(model.shared.get(key, value)) for key, value in state.shared.items()}
+def continued(model: Model, before: Recipe, scene: Scene, recipe: Recipe, seed: int) -> TrainState:
+    """Return the state before the first iteration of a recipe that continues a model, as ``train --init RUN`` does.
+
+    Raises
+    ------
+    InputError
+        The recipe does not train such a model.
+    """
+    rng = np.random.default_rng(seed)
+    population = convert_population(model.gaussians, before.representation, recipe.representation, rng)
+    if population is None:
+        raise InputError(f"recipe {recipe.name} does not train what {before.name} does: give another --after")
+    state = initial_state(scene, recipe._replace(starts_densely=False), seed)
+    begin_with(state, population, model.shared, rng)
     return state
 
 

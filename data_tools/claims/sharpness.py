@@ -27,7 +27,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from data_tools.claims import kit
 from data_tools.claims.adaptive import warm_up
 from data_tools.claims.folds import all_photographs, make_fold, read_small, recipe_of
-from data_tools.claims.kit.claim import CONTINUES, NAMES, RESUMED_OUT, SEEDS, argument, declare, number
+from data_tools.claims.kit.claim import CONTINUES, LONG_SIDE, NAMES, RESUMED_OUT, SEEDS, argument, declare, folds
 from data_tools.claims.kit.figures import subplots
 from data_tools.claims.pose import Disturbance, disturb_poses
 from minisplat_ref.errors import InputError
@@ -282,13 +282,13 @@ CLAIMS = (
         run,
         argument("scenes", nargs="+", metavar="SCENE", help="folders of scenes, or synthetic ones"),
         RESUMED_OUT,
-        number("--folds", 3, "held out is every K-th photograph", minimum=2, metavar="K"),
+        folds(3),
         argument("--recipes", type=NAMES, default=("adaptive",), metavar="R,Q", help="R+NAME=VALUE changes a setting"),
         argument("--degrees", type=float, default=0.0, metavar="A", help="by which each camera is turned (default 0)"),
         argument(
             "--focal", type=float, default=0.0, metavar="F", help="relative error of the focal lengths (default 0)"
         ),
-        number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
+        LONG_SIDE,
         SEEDS,
         description="Train on folds, and measure what displacements of held-out renderings gain. " + CONTINUES,
     ),

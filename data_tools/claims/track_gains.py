@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 from data_tools.claims import kit
 from data_tools.claims.folds import read_small
-from data_tools.claims.kit.claim import NAMES, OUT, SEEDS, argument, declare, number
+from data_tools.claims.kit.claim import LONG_SIDE, NAMES, OUT, SEEDS, argument, declare
 from data_tools.claims.kit.figures import subplots
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED
@@ -265,7 +265,7 @@ CLAIMS = (
         run,
         argument("scenes", nargs="+", metavar="SCENE", help="folders of scenes, or synthetic ones"),
         OUT,
-        number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX"),
+        LONG_SIDE,
         argument(
             "--kinds",
             type=NAMES,

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from minisplat_ref.training.population_check import check_population
 from minisplat_ref.training.recipe_settings import apply_decisions, settings_of
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import FILE_FRAME, Scene
+from minisplat_ref.types import FILE_FRAME, Floats, Scene
 
 
 def initial_state(
@@ -97,6 +97,27 @@ def initial_state(
         frame=scene.frame,
         pace=pace,
     )
+
+
+def begin_with(state: TrainState, population: Any, shared: Mapping[str, Floats], rng: np.random.Generator) -> None:
+    """Let the state before the first iteration begin with a trained model; moments and statistics begin afresh.
+
+    Parameters
+    ----------
+    state : TrainState
+        Of :func:`initial_state`.
+    population : NamedTuple
+        Of the recipe's representation.
+    shared : mapping
+        The model's shared parameters. Those of the state that are not among them begin as they would, and others are
+        left out.
+    rng : numpy.random.Generator
+        Of the training.
+    """
+    state.gaussians = contiguous(population)
+    state.adam = zero_moments(state.gaussians)
+    state.shared = {name: np.array(shared.get(name, first)) for name, first in state.shared.items()}
+    state.rng = rng
 
 
 def _add_dense_points(scene: Scene, budget: int | None) -> Scene:

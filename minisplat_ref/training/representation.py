@@ -56,9 +56,42 @@ class Representation(NamedTuple):
     """``from_file(path, scene, sh_degree, rng)``: the population of a file that ``--init`` names, where such a file is
     more than points. A training by its recipes needs one, or a run."""
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether Gaussians of 3DGS are trained and rendered as 3DGS does it, however they begin."""
+        return (self.population, self.renderer) == (Gaussians, SPLATTING)
+
 
 GAUSSIANS = Representation("gaussians")
 """3DGS: static Gaussians with spherical harmonics."""
+
+
+def convert_population(
+    population: Any, theirs: Representation, wanted: Representation, rng: np.random.Generator
+) -> Any:
+    """Return a trained population as that of another representation, with which a training continues.
+
+    It stays as it is where both are of one kind, and where both are of 3DGS and differ only in how they begin.
+
+    Parameters
+    ----------
+    population : NamedTuple
+        Of ``theirs``.
+    theirs, wanted : Representation
+    rng : numpy.random.Generator
+        For what ``wanted.extend`` draws.
+
+    Returns
+    -------
+    NamedTuple or None
+        None where it is of another kind, with fields that ``wanted`` has not.
+    """
+    is_same = wanted.name == theirs.name or (wanted.is_plain and theirs.is_plain)
+    if is_same and theirs.name not in wanted.extends:
+        return population
+    if type(population) is Gaussians or theirs.name in wanted.extends:
+        return wanted.extend(population, rng)
+    return None
 
 
 def count_floats(population: Any) -> int:

@@ -16,6 +16,7 @@ from PIL import Image
 
 from browser import WEBGL, Browser, find_browser
 from minisplat_ref.extensions.fans.mesh_files import write_mesh as write_translucent
+from minisplat_ref.io import write_image
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
 from minisplat_ref.mechanisms.meshes.files import write_mesh
 from minisplat_ref.mechanisms.peeling.kernels import peel
@@ -28,6 +29,7 @@ SECONDS = 60.0
 LOADER = "examples/jsm/loaders/GLTFLoader.js"
 BACKGROUND = (26, 51, 77)  # of 255
 NEAR, FAR = 0.1, 20.0
+GAP = 12  # pixels between two pictures
 LEVELS = 1  # of 255, by which a pixel may differ: rounding once here and once there
 EDGES_MAX = 0.002  # share of pixels that may differ by more: an edge passes through their centres, 4e-4 were measured
 
@@ -123,11 +125,17 @@ def shown(browser, three, path, folder):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(drawn.split(",")[1]))).convert("RGB"))
 
 
-def check_same(theirs, mesh):
-    """Assert that an image is that of a mesh as we draw it, but for edges, and that it shows enough of the mesh."""
+def check_same(theirs, mesh, folder):
+    """Assert that an image is that of a mesh as we render it, but for edges, and that it shows enough of the mesh.
+
+    Both are written side by side: ``--basetemp DIR`` keeps them.
+    """
     peeled = peel(mesh, Frame(camera(), NEAR), np.array(BACKGROUND) / 255)
     assert (peeled.n_layers > 0).mean() > 0.2
-    errors = np.abs(theirs - np.rint(255 * peeled.image)).max(axis=2)
+    ours = np.rint(255 * peeled.image)
+    between = np.full((len(ours), GAP, 3), 255)
+    write_image(folder / "theirs_and_ours.png", np.concatenate([theirs, between, ours], axis=1).astype(np.uint8))
+    errors = np.abs(theirs - ours).max(axis=2)
     assert (errors > LEVELS).mean() < EDGES_MAX
 
 
@@ -143,7 +151,7 @@ def test_a_mesh_has_the_colours_of_a_render(browser, three, tmp_path):
     assert np.sum(np.cross(p0, p1) * p2) > 0
     write_mesh(tmp_path / "mesh.glb", mesh)
     opaque = TranslucentMesh(mesh.vertices, np.column_stack([mesh.colors, np.ones(12)]), mesh.faces)
-    check_same(shown(browser, three, tmp_path / "mesh.glb", tmp_path), opaque)
+    check_same(shown(browser, three, tmp_path / "mesh.glb", tmp_path), opaque, tmp_path)
 
 
 def test_fans_blend_and_have_two_sides(browser, three, tmp_path):
@@ -152,4 +160,4 @@ def test_fans_blend_and_have_two_sides(browser, three, tmp_path):
     rgba = np.repeat([[0.8, 0.2, 0.1, 0.7], [0.1, 0.6, 0.9, 0.4]], 3, axis=0)
     mesh = TranslucentMesh(np.concatenate([far, near]), rgba, np.array([[0, 1, 2], [3, 5, 4]]))
     write_translucent(tmp_path / "fans.glb", mesh)
-    check_same(shown(browser, three, tmp_path / "fans.glb", tmp_path), mesh)
+    check_same(shown(browser, three, tmp_path / "fans.glb", tmp_path), mesh, tmp_path)

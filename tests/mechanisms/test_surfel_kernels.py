@@ -25,6 +25,7 @@ from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.rendering import Request, activate
 from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.types import Camera, Model, Primitives, view_from
+from rows import assert_same_rows
 from scenes import as_dtype, make_camera, make_gaussians, turned_camera
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
@@ -78,17 +79,7 @@ def random_primitives(rng, n, size=0.3):
 
 
 def assert_same(found, expected):
-    """Floats by the largest of each surfel's row, whole numbers exactly."""
-    for name in ARRAYS:
-        got, want = getattr(found, name), getattr(expected, name)
-        assert got.dtype == want.dtype and got.shape == want.shape, name
-        if want.dtype == np.int32:
-            assert_array_equal(got, want, err_msg=name)
-        else:
-            per_row = tuple(range(1, want.ndim))
-            size = np.abs(want).max(axis=per_row, initial=0)
-            error = np.abs(got - want).max(axis=per_row, initial=0)
-            assert (error <= PARITY_FLOAT64 * size).all(), (name, error / np.where(size > 0, size, 1))
+    assert_same_rows(found, expected, ARRAYS)
     assert (found.rules, found.near_plane) == (expected.rules, expected.near_plane)
     assert_allclose(found.pivot, expected.pivot, rtol=CLOSED_FORM)
 

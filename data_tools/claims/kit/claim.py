@@ -135,6 +135,11 @@ def fine_tune(default: int) -> Argument:
     return number("--fine-tune", default, "iterations of fine-tuning", metavar="M")
 
 
+def folds(default: int) -> Argument:
+    """Return ``--folds``, of which each holds out every K-th photograph."""
+    return number("--folds", default, "held out is every K-th photograph", minimum=2, metavar="K")
+
+
 def trainings(iterations_: int, recipe_: str) -> tuple[Argument, ...]:
     """Return the arguments of a scene that is trained once per seed, unless its Gaussians are given."""
     return (SCENE, OUT, downscale(), recipe(recipe_), iterations(iterations_), PLY, seeds(3))
@@ -149,6 +154,7 @@ PLY = argument("--ply", type=Path, metavar="FILE", help="take these Gaussians in
 SEEDS = argument(
     "--seeds", type=list_of(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
 )
+LONG_SIDE = number("--long-side", 480, "make photographs a whole number of times smaller, to this", 16, "PX")
 CONTINUES = "The same command with the same folder continues where it was interrupted."
 
 CONDITION_HELP = (

@@ -13,13 +13,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.frames import place_points
 from minisplat_ref.io.ply import MEANS, NORMALS, load_points
 from minisplat_ref.io.ply_file import property_names
-from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, are_seen
-from minisplat_ref.strategy.ops import contiguous, n_rows
-from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.calibration import EXPOSURE, LEARNED
-from minisplat_ref.training.initial_state import initial_state
-from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.initial_state import begin_with, initial_state
+from minisplat_ref.training.representation import Representation, convert_population
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Model, Scene
@@ -104,11 +102,9 @@ def continue_model(folder: Path, scene: Scene, recipe: Recipe, seed: int) -> Sta
         )
     state = initial_state(scene, recipe, seed)
     rng = np.random.default_rng(seed)
-    state.gaussians = contiguous(_convert_population(folder, model, owner.representation, recipe, rng))
-    state.adam = zero_moments(state.gaussians)
+    population = _convert_population(folder, model, owner.representation, recipe, rng)
     _check_shared(folder, model, state, recipe)
-    state.shared = {name: np.array(model.shared.get(name, first)) for name, first in state.shared.items()}
-    state.rng = rng
+    begin_with(state, population, model.shared, rng)
     theirs_name, our_name = (part.representation.renderer.name for part in (owner, recipe))
     source = (
         f"{n_rows(state.gaussians):,} Gaussians of {folder}, trained with {theirs.recipe} and rendered by {theirs_name}"
@@ -128,22 +124,14 @@ def _convert_population(
     InputError
         They are of another kind that has fields which the recipe does not train.
     """
-    wanted, name = recipe.representation, theirs.name
-    is_same = wanted.name == name or (_is_plain(wanted) and _is_plain(theirs))
-    if is_same and name not in wanted.extends:
-        return model.gaussians
-    if type(model.gaussians) is Gaussians or name in wanted.extends:
-        return wanted.extend(model.gaussians, rng)
+    converted = convert_population(model.gaussians, theirs, recipe.representation, rng)
+    if converted is not None:
+        return converted
     further = ", ".join(field for field in model.gaussians._fields if field not in Gaussians._fields)
     raise InputError(
-        f"{folder} holds {name} with {further or 'other fields'}, which recipe {recipe.name} does not train: take a"
-        f" recipe of its extension, or give --init {folder / POINT_CLOUD} to start from its points alone"
+        f"{folder} holds {theirs.name} with {further or 'other fields'}, which recipe {recipe.name} does not train:"
+        f" take a recipe of its extension, or give --init {folder / POINT_CLOUD} to start from its points alone"
     )
-
-
-def _is_plain(representation: Representation) -> bool:
-    """Return whether Gaussians of 3DGS are trained and rendered as 3DGS does it, however they begin."""
-    return (representation.population, representation.renderer) == (Gaussians, SPLATTING)
 
 
 def _check_shared(folder: Path, model: Model, state: TrainState, recipe: Recipe) -> None:
