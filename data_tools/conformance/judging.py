@@ -72,7 +72,6 @@ def _habits() -> Iterator[Habits]:
                 conventions,
                 conventions._replace(eps2d=0.0),
                 conventions._replace(is_antialiased=True),
-                conventions._replace(alpha_min=0.0),
             ):
                 yield Habits(changed, SQRT_8)
     yield Habits(VIEWER, SQRT_8, True)

@@ -18,15 +18,16 @@ from minisplat_ref.types import Floats
 ZOOM = 3
 HEAD = """# Conformance: what public renderers compute
 
-Written by `python -m data_tools.conformance --out DIR`, which fetches each renderer in the version named here and shows
-it {n} probes: scenes of one to forty Gaussians, 96 x 64 pixels, each of which isolates a rule. A renderer is judged by
-the profile that is nearest to its pictures (`VIEWER`: no clamp of alpha, no stop), with habits of viewers that no
-profile has: Gaussians cut off at the square root of 8 deviations, or lowered to 0 there, and no low-pass. A picture
-of 8 bits agrees if no pixel is more than {levels} levels (of 255) off, and {more} more for each hit, which a buffer of
-8 bits rounds; pixels at the cut are not compared. Where it differs, each planted fault of the oracle is tried, and one
-that leaves no more is the rule in which it differs. The rest is unexplained: no single rule makes that picture. That is
-not yet to say that it is wrong. Two errors were confirmed by hand and in the source: of
-[gsplat.js](conformance/gsplatjs.md) and of [GaussianSplats3D](conformance/gaussian-splats-3d.md).
+Written by `python -m data_tools.conformance --out DIR`, which fetches each renderer in the version named here and
+shows it {n} probes: scenes of one to forty Gaussians, 96 x 64 pixels, each of which isolates a rule. A renderer is
+judged by the profile that is nearest to its pictures (`VIEWER`: no clamp of alpha, no stop), with habits of viewers
+that no profile has: Gaussians cut off at the square root of 8 deviations, or lowered to 0 there, and no low-pass.
+(That of gsplat.js is 0.3 in quarters of px^2, 0.075 px^2, which these probes hardly tell from none.) A picture of 8
+bits agrees if no pixel is more than {levels} levels (of 255) off, and {more} more for each hit, which a buffer of 8
+bits rounds; pixels at the cut are not compared. Where it differs, each planted fault of the oracle is tried, and one
+that leaves no more is named: it makes this picture, and need not be its cause. The rest is unexplained: no single
+rule makes that picture. That is not yet to say that it is wrong. Two errors were confirmed by hand and in the source:
+of [gsplat.js](conformance/gsplatjs.md) and of [GaussianSplats3D](conformance/gaussian-splats-3d.md).
 
 """
 

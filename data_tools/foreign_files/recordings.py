@@ -1,4 +1,4 @@
-"""Recordings as phones and older cameras make them: frames at a variable rate, and pixels that are no squares."""
+"""Recordings as phones and older cameras make them: frames at a variable rate, and pixels that are not square."""
 
 import subprocess
 from collections.abc import Callable, Mapping

@@ -5,7 +5,7 @@ the mean square of the Laplacian of the brightness: between frames of one place 
 different places cannot be compared.
 
 Each frame that is stored counts once. Phones film at a variable rate, and ffmpeg by itself would repeat frames until
-the rate is constant. Frames whose pixels are no squares, as in DV, AVCHD or anamorphic films, are enlarged along one
+the rate is constant. Frames whose pixels are not square, as in DV, AVCHD or anamorphic films, are enlarged along one
 side, because a camera of one focal length has square ones.
 """
 

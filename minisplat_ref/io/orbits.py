@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.io.upright import Y_DOWN, find_up
+from minisplat_ref.io.upright import MINUS_Y, find_up
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.types import Camera, Floats
 
@@ -63,7 +63,7 @@ def orbit(
     """
     cameras = [view.camera for view in like]
     if up is None:
-        up = find_up(cameras, means).direction if cameras else Y_DOWN
+        up = find_up(cameras, means).direction if cameras else MINUS_Y
     path = _path_of_cameras(cameras, width, up) if cameras else _path_of_means(means, width, height, up)
     first, last = path.covered
     if arc is not None:

@@ -23,6 +23,7 @@ from minisplat_ref.io.json_file import as_array, read_json
 from minisplat_ref.types import Bools, Camera, Floats
 
 FILE = "up.json"  # in the folder of a scene
+# Numbers of ours, chosen on banana, lund, buddha, fox and snowmiku with photographs turned by hand:
 ROLL_MAX = np.radians(20.0)  # of a camera that was held level, more or less
 ALIKE_MIN = 0.5  # share of the cameras, weighed by their evidence, that were held level, if all were held alike
 EVIDENCE_MIN = 0.1  # of a camera, in the mean: less where all look along the direction
@@ -30,7 +31,7 @@ HELD_MIN = 0.8  # of the share if they may have been turned
 WALL_EVIDENCE, UPSIDE_DOWN_MAX = 1 / 3, 0.2  # of a wall: less than of a ground, and hardly any camera upside down
 ALONG = 0.9  # an axis that is so nearly vertical is not turned into the horizontal
 TINY = 1e-9
-Y_DOWN = np.array([0.0, -1.0, 0.0])  # what is up where nothing else is known
+MINUS_Y = np.array([0.0, -1.0, 0.0])  # what is up where nothing else is known
 GROUND_SHARE_MIN = 0.05  # of the points, on the plane
 BELOW_MAX = 0.15  # of the points
 ABOVE_MIN = 0.9  # of the cameras
@@ -52,7 +53,7 @@ class Up(NamedTuple):
     """In a few words."""
 
 
-UNKNOWN = Up(Y_DOWN, "the y axis, which points down")
+UNKNOWN = Up(MINUS_Y, "the y axis, which points down")
 
 
 def find_up(cameras: Sequence[Camera], points: Floats, is_level: Bools | None = None) -> Up:
@@ -81,6 +82,35 @@ def find_up(cameras: Sequence[Camera], points: Floats, is_level: Bools | None = 
     if ground is not None and not _is_wall(ground, by_edges, rotations):
         return Up(ground, "the plane of the ground among the points")
     return Up(by_edges, "the edges of the images")
+
+
+def choose_up(given: str | None, recorded: Up | None, views: Sequence[Any], points: Floats) -> Up | None:
+    """Return what is up: as a person gives it, or else as it was recorded, or as cameras and points show.
+
+    Parameters
+    ----------
+    given : str, optional
+        As for :func:`given_up`.
+    recorded : Up, optional
+    views : sequence
+        Of photographs or viewpoints, with ``name`` and ``camera``.
+    points : ndarray of shape (P, 3)
+        World frame.
+
+    Returns
+    -------
+    Up or None
+        None where nothing is given or recorded and there are no cameras.
+
+    Raises
+    ------
+    InputError
+        ``given`` makes no sense.
+    """
+    names, cameras = [view.name for view in views], [view.camera for view in views]
+    if given is not None:
+        return given_up(given, names, cameras)
+    return recorded or (find_up(cameras, points) if cameras else None)
 
 
 def common_up(rotations: Floats) -> Floats:

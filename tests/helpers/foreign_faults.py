@@ -1,7 +1,8 @@
 """Errors in other people's renderers, each a line of source that is replaced, and what a first hint has to say of them.
 
-None is made of the package's own faults. Some change a formula in a way that no planted fault has; then the hint has to
-name the formula. ``SOUND`` are replacements that change nothing but the spelling.
+None was made of the package's own faults, to which the two that were missed have been added since. Some change a
+formula in a way that no planted fault has; then the hint has to name the formula. ``SOUND`` are replacements that
+change nothing but the spelling.
 """
 
 import re

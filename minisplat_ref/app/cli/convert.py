@@ -30,7 +30,6 @@ Compact formats have levels of precision, of which 0 is the finest:
   --max-drop dB   the coarsest level that loses at most so much PSNR, measured
                   on at most 24 training views of the run, or of --scene
 """
-LEVELS = "lod-meta.json"
 EPILOG = """\
 --axes is that of the .spz that is read, or written if none is: RUB by its
 specification, RDF (those of the PLY) in some programs.
@@ -83,12 +82,13 @@ def run(args: argparse.Namespace) -> int:
         open_source,
     )
     from minisplat_ref.io.formats import mapped, write_file
+    from minisplat_ref.io.other_places import SOG_LEVELS
     from minisplat_ref.io.upright import describe_up
 
     out: Path = args.output
     if out.suffix.lower() == ".html":
         return _write_page(args)
-    if out.name == LEVELS:
+    if out.name == SOG_LEVELS:
         return _write_levels(args)
     format_ = choose_format(out)
     if args.up is not None and (format_ is None or format_.suffix != ".glb"):

@@ -50,7 +50,7 @@ def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> "I
     size : pair of float
         Width and height, inches.
     """
-    from matplotlib import rc_context  # not at the top: a training, whose report may lack curves, needs it not
+    from matplotlib import rc_context  # not at the top: a training, whose report may lack curves, does not need it
     from matplotlib.figure import Figure
 
     with rc_context(PLOT_STYLE):

@@ -19,8 +19,9 @@ from minisplat_ref.io import viewpoints
 from minisplat_ref.io.formats import Format, with_label
 from minisplat_ref.io.frames import frame_of_means, place_scene
 from minisplat_ref.io.label import NO_LABEL, Label
+from minisplat_ref.io.other_places import SOG_LEVELS
 from minisplat_ref.io.ply import are_far
-from minisplat_ref.io.upright import Up, find_up, given_up, upright_rotation
+from minisplat_ref.io.upright import Up, choose_up, upright_rotation
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
@@ -125,7 +126,7 @@ def choose_format(path: Path) -> Format | None:
     format_ = find_format(path)
     if format_ is None and path.suffix != ".ply":
         written = [known.suffix for _, known in all_formats() if known.levels]
-        suffixes = " or ".join([".ply", *written, ".html (a page to send)", "lod-meta.json"])
+        suffixes = " or ".join([".ply", *written, ".html (a page to send)", SOG_LEVELS])
         raise InputError(f"{path} is not named like a PLY or another format: give a name that ends in {suffixes}")
     if format_ is not None and not format_.levels:
         raise InputError(f"{path}: a {format_.suffix} is read, but not written: choose another format")
@@ -144,11 +145,8 @@ def find_up_of(path: Path, gaussians: Gaussians, given: str | None) -> Up | None
     from minisplat_ref.app.runs.settings import load_up
 
     views = viewpoints.read(path / CAMERAS) if (path / CAMERAS).is_file() else []
-    names, cameras = [view.name for view in views], [view.camera for view in views]
-    if given is not None:
-        return given_up(given, names, cameras)
     recorded = load_up(path) if (path / CONFIG).is_file() else None
-    return recorded or (find_up(cameras, gaussians.means) if cameras else None)
+    return choose_up(given, recorded, views, gaussians.means)
 
 
 def make_upright(gaussians: Gaussians, up: Up) -> Gaussians:

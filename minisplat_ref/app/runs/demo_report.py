@@ -37,6 +37,7 @@ from minisplat_ref.app.runs.report_parts import ERROR_TEXT, training_curves, vie
 from minisplat_ref.app.runs.run import Outcome
 from minisplat_ref.app.runs.scoring import load_trained
 from minisplat_ref.datasets.synthetic import SyntheticScene
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Floats, Scene
@@ -126,7 +127,8 @@ def report_html(
         ("Scene", f"synthetic room, {n_train} training and {n_test} test views of {size} pixels, in {settings.scene}"),
         (
             "Recipe",
-            f"{settings.recipe}, {metrics['iterations']:,} iterations, into which its 18,000 are compressed",
+            f"{settings.recipe}, {metrics['iterations']:,} iterations, into which its"
+            f" {get_recipe(settings.recipe).iterations:,} are compressed",
         ),
         ("Seed", f"{settings.seed}: the same seed gives the same result"),
         ("Conventions", f"{settings.profile}, the default"),

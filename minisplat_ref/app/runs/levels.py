@@ -26,11 +26,11 @@ from minisplat_ref.app.runs.simplification import blend_weights, evaluate_views,
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.formats.sog import SOG
+from minisplat_ref.io.other_places import SOG_LEVELS
 from minisplat_ref.strategy.ops import concat, n_rows, take
 from minisplat_ref.types import Bools, Floats, Gaussians, Model
 
-FILE = "lod-meta.json"
-N_LEVELS = 4
+N_LEVELS = 4  # ours, as are the next two
 SMALLEST = 64  # Gaussians: a level of fewer shows nothing
 PART = 131_072  # Gaussians of the finest level in a part, at most
 REACH = 3.0  # standard deviations to which a Gaussian is seen
@@ -121,7 +121,7 @@ def write_levels(run: Run, out: Path, part: int = PART) -> list[Level]:
             "filenames": filenames,
             "tree": root,
         }
-        (folder / FILE).write_text(json.dumps(document), encoding="utf-8")
+        (folder / SOG_LEVELS).write_text(json.dumps(document), encoding="utf-8")
     return levels
 
 

@@ -19,7 +19,7 @@ from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.frames import place_camera
 from minisplat_ref.io.orbits import nearest_to_axes
-from minisplat_ref.io.upright import UNKNOWN, Up, find_up, given_up
+from minisplat_ref.io.upright import UNKNOWN, Up, choose_up
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest, marching_cubes_package
 from minisplat_ref.mechanisms.fusion.kernels import fuse
@@ -96,9 +96,7 @@ def open_for_mesh(folder: Path, up: str | None = None) -> Opened:
     trained, frame = load_trained(folder), load_frame(folder)
     every = viewpoints.read(folder / run_folder.CAMERAS)
     every = [view._replace(camera=place_camera(view.camera, frame)) for view in every]
-    names, cameras = [view.name for view in every], [view.camera for view in every]
-    found = load_up(folder) if up is None else given_up(up, names, cameras)
-    found = found or find_up(cameras, trained.model.gaussians.means)
+    found = choose_up(up, load_up(folder), every, trained.model.gaussians.means) or UNKNOWN
     return Opened(trained, [view for view in every if view.split != "test"] or every, frame, found)
 
 

@@ -14,7 +14,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.frames import frame_of_means, place_camera
-from minisplat_ref.io.upright import UNKNOWN, Up, find_up, given_up
+from minisplat_ref.io.upright import UNKNOWN, Up, choose_up
 from minisplat_ref.io.viewpoints import Viewpoint
 from minisplat_ref.mechanisms.gbuffer.lighting import relight
 from minisplat_ref.types import Frame, Model
@@ -83,13 +83,8 @@ def open_source(
 
 def _choose_up(source: Source, given: str | None) -> Up:
     """Return what is up: as given, as the run has recorded, or as cameras and Gaussians show."""
-    names, cameras = [view.name for view in source.cameras], [view.camera for view in source.cameras]
-    if given is not None:
-        return given_up(given, names, cameras)
     recorded = load_up(source.path) if source.path.is_dir() else None
-    if recorded is not None:
-        return recorded
-    return find_up(cameras, source.trained.model.gaussians.means) if cameras else source.up
+    return choose_up(given, recorded, source.cameras, source.trained.model.gaussians.means) or source.up
 
 
 def _open_run(folder: Path, extension: str | None) -> Source:

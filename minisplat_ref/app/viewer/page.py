@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.app.viewer.poses import choose_start, make_upright
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.formats.levels8 import opacities_of
 from minisplat_ref.io.orbits import orbit
 from minisplat_ref.io.packing.deflating import gzip_compressor
 from minisplat_ref.io.packing.pieces import pieces, rows_of
@@ -142,4 +143,4 @@ def _rotations(rows: Gaussians) -> NDArray:
 
 
 def _opacities(rows: Gaussians) -> NDArray:
-    return np.rint(65535 * 0.5 * (1.0 + np.tanh(0.5 * rows.opacity_logits))).astype("<u2")  # of the sigmoid
+    return np.rint(65535 * opacities_of(rows.opacity_logits)).astype("<u2")

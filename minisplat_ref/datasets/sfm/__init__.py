@@ -36,7 +36,7 @@ from minisplat_ref.io.upright import Up
 
 PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
 ROUNDS = 2  # in which photographs are told apart by their focal lengths, the second one with right cameras
-ZOOM_SHARE = 0.5  # of the photographs; with fewer placed, one camera for all of a size may be why
+ZOOM_SHARE = 0.5  # of the photographs, ours; with fewer placed, one camera for all of a size may be why
 POINTS_MIN = 150  # for each photograph; with fewer, dense features are tried
 
 

@@ -28,6 +28,7 @@ from minisplat_ref.datasets.sfm.photographs import Group, Photographs
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.io.lens import import_quiet_pycolmap
 
+# Numbers of ours, chosen on synthetic photographs with two and three focal lengths, and on scenes with one:
 RATIO_MIN = 1.1  # of two neighbouring focal lengths of different groups; autofocus alone changes some percent
 GROUP_MIN = 2  # photographs
 SPREADS_MIN = 4.0  # between the means of two groups, in standard deviations of the wider one

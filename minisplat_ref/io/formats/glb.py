@@ -42,6 +42,7 @@ from minisplat_ref.io.formats.levels8 import (
     color_bytes,
     finish,
     finite_scales,
+    opacities_of,
     opacity_bytes,
     refuse_size,
 )
@@ -161,7 +162,7 @@ def _rotations(gaussians: Gaussians) -> NDArray:
 
 
 def _opacities(gaussians: Gaussians) -> NDArray:
-    return (0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))).astype("<f4")
+    return opacities_of(gaussians.opacity_logits.astype(np.float64)).astype("<f4")
 
 
 def _rest_names(n_rest: int) -> list[str]:

@@ -21,9 +21,14 @@ def to_bytes(values: Floats) -> NDArray[np.uint8]:
     return np.clip(np.floor(255.0 * values + 0.5), 0, 255).astype(np.uint8)
 
 
+def opacities_of(logits: Floats) -> Floats:
+    """Return the sigmoid of logits, without an overflow."""
+    return 0.5 * (1.0 + np.tanh(0.5 * logits))
+
+
 def opacity_bytes(logits: Floats) -> NDArray[np.uint8]:
     """Return opacities in 255ths."""
-    return to_bytes(0.5 * (1.0 + np.tanh(0.5 * logits.astype(np.float64))))
+    return to_bytes(opacities_of(logits.astype(np.float64)))
 
 
 def decode_logits(levels: NDArray[np.uint8]) -> Floats:

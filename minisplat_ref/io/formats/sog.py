@@ -15,7 +15,7 @@ Up to 65,536 Gaussians have an entry each. Of more, the palette is the means of 
 halved along the coefficient of largest variance; of more than a million, the tree is that of a sample from all over the
 scene. Codebooks begin at equal shares of the cube root of the histogram, which is best for squared errors where levels
 are many, and are improved by Lloyd's steps. We write Gaussians in Morton order. The frame is that of the PLY. Left out
-are version 1, folders without a ZIP, and levels of detail.
+are version 1 and reading levels of detail, which :mod:`minisplat_ref.app.runs.levels` writes.
 """
 
 import json

@@ -49,6 +49,7 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.formats import Format, spz_streams
 from minisplat_ref.io.formats.axes import AXES, OURS, check_axes, describe_axes, ours_from, turn
+from minisplat_ref.io.formats.levels8 import opacities_of
 from minisplat_ref.io.packing.deflating import gzip_compressor
 from minisplat_ref.io.packing.pieces import pieces
 from minisplat_ref.types import Floats, Gaussians, Ints
@@ -138,7 +139,7 @@ def encode(gaussians: Gaussians, level: int, axes: str = SPECIFIED) -> bytes:
 def _encode_rows(rows: Gaussians, header: _Header) -> tuple[NDArray, ...]:
     """Return the bytes of Gaussians in the axes of the file, attribute by attribute in its order."""
     steps = np.floor(rows.means.astype(np.float64) * 2.0**header.fractional_bits + 0.5)  # [n, 3]
-    opacities = 0.5 * (1.0 + np.tanh(0.5 * rows.opacity_logits.astype(np.float64)))  # the sigmoid
+    opacities = opacities_of(rows.opacity_logits.astype(np.float64))
     quats = rows.quats.astype(np.float64)
     return (
         steps.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],

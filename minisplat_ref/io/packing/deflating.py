@@ -8,7 +8,7 @@ import zlib
 from typing import Any
 
 FINEST, USUAL = 9, 6  # levels of zlib
-LARGE = 1 << 24  # bytes before packing, of some 250,000 Gaussians of degree 3
+LARGE = 1 << 24  # bytes before packing, of some 250,000 Gaussians of degree 3; ours
 GZIP = 31  # window bits of a gzip stream, without a file name and a time
 
 

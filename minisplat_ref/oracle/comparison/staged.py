@@ -14,7 +14,7 @@ from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.comparison.doubts import doubts
 from minisplat_ref.oracle.comparison.hints import Hint, Scene, find_hints, in_words
 from minisplat_ref.oracle.comparison.measures import Bounds, Difference, compare_bounds, compare_lists, difference
-from minisplat_ref.oracle.comparison.trials import BY_ROW, NOT_OF_FAULTS, Evidence, comparable
+from minisplat_ref.oracle.comparison.trials import BY_ROW, NOT_OF_FAULTS, Evidence, comparable, shown_rows
 from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, Golden, names_of
 from minisplat_ref.oracle.renderer import ComparedRenderer
 from minisplat_ref.types import Bools
@@ -223,9 +223,7 @@ def _row_of_arrays(
     compared = {name: comparable(name, given[name], truth) for name in found}
     for name, (a, b) in compared.items():
         if name in BY_ROW:
-            rows = truth.arrays["radii"][:, 0] > 0
-            if "radii" in given:
-                rows = rows & (given["radii"].reshape(len(rows), -1)[:, 0] > 0)
+            rows = shown_rows(given, truth)
             a, b = a[rows], b[rows]
         tolerance = SPECS[name].tolerance.of(renderer.dtype or given[name].dtype)
         differences[name] = difference(a, b, tolerance, may_flip.get(name))

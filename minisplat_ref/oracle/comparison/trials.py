@@ -50,6 +50,14 @@ def comparable(name: str, given: Floats, truth: Golden) -> tuple[Floats, Floats]
     return given, expected
 
 
+def shown_rows(given: Arrays, truth: Golden) -> Bools:
+    """Return the Gaussians [N] that the truth shows and, if it gives radii, the renderer does."""
+    rows: Bools = truth.arrays["radii"][:, 0] > 0
+    if "radii" in given:
+        rows = rows & (given["radii"].reshape(len(rows), -1)[:, 0] > 0)
+    return rows
+
+
 class Trace(NamedTuple):
     """An array of the renderer, of which the values that count are kept."""
 
@@ -86,9 +94,7 @@ def traces_of(evidence: Evidence, wrong: frozenset[str], *, is_forward: bool) ->
             continue
         keep = np.ones(b.shape, bool)
         if name in BY_ROW:
-            rows = evidence.truth.arrays["radii"][:, 0] > 0
-            if "radii" in evidence.given:
-                rows = rows & (evidence.given["radii"].reshape(len(rows), -1)[:, 0] > 0)
+            rows = shown_rows(evidence.given, evidence.truth)
             keep &= rows.reshape(rows.shape + (1,) * (b.ndim - 1))
         if name in evidence.may_flip:
             aside = evidence.may_flip[name]

@@ -303,18 +303,6 @@ def with_bands(factors: Callable[[int], float]) -> Backend:
     )
 
 
-def without_highest_band(_: float) -> Backend:
-    """Return a backend that leaves out the highest degree of the harmonics."""
-
-    def cut(sh_rest: Floats) -> Floats:
-        degree = round(np.sqrt(sh_rest.shape[1] + 1)) - 1
-        return np.where(np.arange(1, sh_rest.shape[1] + 1)[None, :, None] < degree**2, sh_rest, 0)
-
-    return _change_coefficients(
-        lambda sh_dc, sh_rest: (sh_dc, cut(sh_rest)), lambda v: v._replace(sh_rest=cut(v.sh_rest))
-    )
-
-
 def with_coefficient(k: int, factor: float) -> Backend:
     """Return a backend with coefficient ``k`` of :attr:`sh_rest` multiplied by a factor, where there is one."""
 

@@ -7,12 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from minisplat_ref.app.cli import main
-from minisplat_ref.app.runs import levels
 from minisplat_ref.app.runs.levels import write_levels
 from minisplat_ref.app.runs.opened_run import open_run
 from minisplat_ref.io import load_ply
 from minisplat_ref.io.formats import read_content
 from minisplat_ref.io.formats.sog import SOG
+from minisplat_ref.io.other_places import SOG_LEVELS
 from run_commands import refused, write_room  # noqa: F401  (a fixture)
 
 SCENE = {"n_views": 10, "width": 48, "height": 36, "n_points": 600, "test_every": 5}
@@ -44,8 +44,8 @@ def decoded(folder, meta, level):
 
 def test_every_level_halves_and_parts_hold_all(run, tmp_path):
     """Four levels in parts of at most 200: each Gaussian of the finest is in one part, inside of its bound."""
-    written = write_levels(open_run(run), tmp_path / "out" / levels.FILE, part=200)
-    meta = json.loads((tmp_path / "out" / levels.FILE).read_text())
+    written = write_levels(open_run(run), tmp_path / "out" / SOG_LEVELS, part=200)
+    meta = json.loads((tmp_path / "out" / SOG_LEVELS).read_text())
     n = len(load_ply(run / "point_cloud.ply").means)
     assert meta["counts"] == [n, n >> 1, n >> 2, n >> 3] == [level.n_gaussians for level in written]
     assert meta["lodLevels"] == 4 and meta["version"] == 1 and meta["count"] == sum(meta["counts"])
@@ -64,9 +64,9 @@ def test_every_level_halves_and_parts_hold_all(run, tmp_path):
 
 def test_losses_are_those_of_the_levels(run, tmp_path, capsys):
     """Coarser levels lose more, the finest next to nothing; the file and the terminal say the same."""
-    assert main(["convert", str(run), str(tmp_path / "out" / levels.FILE)]) == 0
+    assert main(["convert", str(run), str(tmp_path / "out" / SOG_LEVELS)]) == 0
     printed = capsys.readouterr().out
-    meta = json.loads((tmp_path / "out" / levels.FILE).read_text())
+    meta = json.loads((tmp_path / "out" / SOG_LEVELS).read_text())
     losses = meta["asset"]["psnrLoss"]
     assert abs(losses[0]) < 0.2 and losses[1] < losses[2] < losses[3] and losses[3] > 0.5
     for number, (count, loss) in enumerate(zip(meta["counts"], losses, strict=True)):
@@ -74,7 +74,7 @@ def test_losses_are_those_of_the_levels(run, tmp_path, capsys):
 
 
 def test_what_is_refused(run, tmp_path, refused):
-    out = tmp_path / "out" / levels.FILE
+    out = tmp_path / "out" / SOG_LEVELS
     assert "--max-bytes means nothing" in refused("convert", run, out, "--max-bytes", "1000")
     assert "is not a folder" in refused("convert", run / "point_cloud.ply", out)
     assert not out.parent.exists()

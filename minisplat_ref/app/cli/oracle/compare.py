@@ -45,8 +45,8 @@ thresholds in binary, and in float64 nothing rounds. (Ours are left out there in
 float32.) Boxes and tile lists that differ without changing the image are
 harmless.
 
-Where something diverges, the three planted faults that look most like it are
-named, and what else to return to tell them apart.
+Where something diverges, up to three planted faults are named that would explain
+it, or come nearest, and what else to return to tell them apart.
 """
 EPILOG = """\
 columns: largest and RMS error; the largest as a part of the largest value of
