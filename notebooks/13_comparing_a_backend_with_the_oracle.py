@@ -32,9 +32,15 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
+from data_tools.conformance.habits import Habits
+from data_tools.conformance.habits import show as render_probe
+from data_tools.conformance.judging import difference, judge
+from data_tools.conformance.probes import PROBES
+from data_tools.conformance.report import NAMES
 from figures import BLUE, GREEN, GREY, RED, draw_ellipses, show
-from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN
+from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.renderers import (
     by_profile,
@@ -119,6 +125,7 @@ print("cosine with the true gradient:", ", ".join(f"{name} {value:.3f}" for name
 # | `minisplat_ref/oracle/comparison/` | the comparison, and what can be compared |
 # | `minisplat_ref/oracle/thresholds.py` | pixels at which rounding decides whether a hit counts |
 # | `minisplat_ref/oracle/planted.py` | copies of our own renderer with one error each |
+# | `data_tools/conformance/` | public renderers on small scenes, and the rules of each |
 #
 # On the command line, `minisplat-ref oracle compare BACKEND` does the same. **Frames and units:** image positions in
 # pixels; `v_x` is dLoss/dx and has the shape of x; errors are relative to the largest value of an array unless a unit
@@ -406,6 +413,54 @@ except InputError as error:
     print(f"not compared: {error}")
 
 # %% [markdown]
+# ## A viewer in a browser
+#
+# A viewer gives no stages, only a canvas of 8 bits. Here are forty Gaussians, as ellipses of one deviation, and what
+# gsplat.js 1.2.9 shows of them, stored in this repository. Above, the reference renders them as 3DGS does; below, by
+# the rules that the viewer's source states. On the right is the difference, times ten.
+
+# %%
+THEIRS = Path("../docs/conformance/gsplatjs_crowd.png")  # python -m data_tools.conformance gsplatjs --out DIR
+probe = next(probe for probe in PROBES if probe.name == "crowd")
+theirs = np.asarray(Image.open(THEIRS)) / 255
+rules = NAMES["gsplatjs"].habits
+by_3dgs, by_its_rules = (render_probe(probe, habits) for habits in (Habits(GSPLAT_MAIN), rules))
+
+figure, axes = plt.subplots(2, 4, figsize=(11, 3.7))
+for row, seen, title in ((0, by_3dgs, "reference, as 3DGS"), (1, by_its_rules, "reference, by its rules")):
+    footprints = seen.projection
+    axes[row, 0].set(title="the probe" if row == 0 else "the same", xlim=(0, 96), ylim=(64, 0), aspect="equal")
+    axes[row, 0].set(xticks=[], yticks=[])
+    for mean, conic in zip(footprints.means2d, footprints.conics, strict=True):
+        if conic[0] > 0:
+            draw_ellipses(axes[row, 0], mean, np.linalg.inv(conic[[[0, 1], [1, 2]]]), edgecolor=BLUE)
+    show(axes[row, 1], np.clip(seen.image, 0, 1), title)
+    show(axes[row, 2], theirs, "gsplat.js 1.2.9")
+    apart = np.abs(theirs - np.clip(seen.image, 0, 1))
+    show(axes[row, 3], np.clip(10 * apart, 0, 1), f"x 10; at most {255 * apart.max():.1f} of 255")
+plt.show()
+
+# %% [markdown]
+# Which of its rules does the picture need? Take back one at a time: a rule that this picture does not need leaves 3.2,
+# the 2.5 of the judgement and pixels at a cut, which it leaves out. "Cut at 2.83 deviations" is what a quad of a fixed
+# size costs, and "a low-pass of 0.075" is 0.3 px² added to four times the covariance. These are choices. The order of
+# the file is not: the viewer sorts, but in scenes of 512 Gaussians and fewer its sort overwrites the means with zeros,
+# and equal depths stay as they are. [The report](../docs/conformance/gsplatjs.md) has the lines, and [the
+# table](../docs/CONFORMANCE.md) the other viewers.
+
+# %%
+verdict = judge(probe, theirs, rules)
+print(f"by all its rules: {verdict.result}, at most {verdict.largest:.1f} of 255")
+without = {}
+for name, words in rules.rules.items():
+    if name in Conventions._fields:
+        plain = rules._replace(conventions=rules.conventions._replace(**{name: getattr(GSPLAT_MAIN, name)}))
+    else:
+        plain = rules._replace(**{name: Habits._field_defaults[name]})
+    without[name] = difference(theirs, render_probe(probe, plain).image).max()
+    print(f"without {words + ':':<62} {without[name]:5.1f}")
+
+# %% [markdown]
 # ## Play
 #
 # Put any of the planted errors, or another precision, on trial. What to look for:
@@ -492,6 +547,9 @@ assert sum(row.difference.n_flips for row in flips) == 12 and max(row.difference
 assert dump_rows["mine"]["means2d"].status == "diverges" and dump_rows["mine"]["depths"].status == "agrees"
 assert abs(dump_rows["mine"]["means2d"].difference.max_error - 0.5) < 1e-4
 assert dump_rows["mine, corrected"]["means2d"].status == "agrees"
+# A viewer's picture is what its rules give, to what 8 bits allow; its order is the largest of them, and an error.
+assert verdict.result == "agrees" and verdict.largest < 3 < difference(theirs, by_3dgs.image).max()
+assert max(without, key=without.__getitem__) == "is_in_file_order" and without["is_in_file_order"] > 50
 # gsplat's own functions agree, if they are installed.
 assert first_divergence(gsplat_rows.values()) is None
 print("all of the above holds")

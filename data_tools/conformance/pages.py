@@ -59,8 +59,8 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @contextmanager
 def serving(folder: Path, packages: Path) -> Iterator[str]:
-    """Serve a folder, ``/viewers`` and ``/node_modules`` on this machine alone; yield the address."""
-    roots = {"": folder, "viewers": DRIVERS, "node_modules": packages / "node_modules"}
+    """Serve a folder, the drivers, ``/node_modules`` and ``/repositories`` on this machine alone; yield the address."""
+    roots = {"": folder, "viewers": DRIVERS} | {name: packages / name for name in ("node_modules", "repositories")}
     handler = type("Handler", (_Quiet,), {"roots": roots})
     server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(handler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()

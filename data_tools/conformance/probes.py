@@ -16,12 +16,13 @@ from minisplat_ref.oracle.golden.format import Golden
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering.backends import REFERENCE
-from minisplat_ref.types import Floats, Gaussians
+from minisplat_ref.types import Camera, Floats, Gaussians
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 80.0  # px
 BLACK, WHITE, RED = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.0)
 ROUND = (1.0, 0.0, 0.0, 0.0)  # quaternion
 UNSEEN = -5.3  # logit of an opacity of 1.3/255, which loaders do not drop
+UNSEEN_DEPTH = 12.0
 TURNED = (0.9, 0.3, -0.2, 0.25)
 
 
@@ -37,6 +38,8 @@ class Probe(NamedTuple):
     """Principal point, px."""
     cam_from_world: tuple[tuple[float, ...], Floats] = (ROUND, np.zeros(3))
     """Rotation as a quaternion, and translation."""
+    is_single: bool = True
+    """Whether one rule is shown, so that planted faults are tried."""
 
     @property
     def camera(self) -> tuple[Floats, Floats]:
@@ -100,7 +103,7 @@ def _harmonics() -> Gaussians:
 
 PROBES = (
     Probe("centre", "the centre of a pixel at 0.5, the exponent, sRGB", _scene(_one((41.3, 27.8), 4, 3.0, 0.8))),
-    Probe("tiny", "the low-pass: a Gaussian of 0.1 pixel", _scene(_one((40.5, 30.5), 4, 0.1, 0.9))),
+    Probe("tiny", "the low-pass: a Gaussian of 0.1 pixel", _scene(_one((40.9, 30.7), 4, 0.1, 0.9))),
     Probe("disc", "a round Gaussian on the axis, whose eigenvectors are any", _scene(_one((48, 32), 4, 5.0, 0.8))),
     Probe("needle", "an ellipse, turned", _scene(_one((50, 30), 4, (9.0, 2.0, 4.0), 0.9, WHITE, TURNED))),
     Probe("tail", "how far a Gaussian reaches", _scene(_one((47.3, 31.2), 4, 6.0, 0.99, WHITE, TURNED))),
@@ -114,7 +117,7 @@ PROBES = (
     Probe(
         "order",
         "order by z or by distance: red has the larger z and the smaller distance",
-        _scene(_one((47, 31), 4.0, 40.0, 0.8, RED), _one((90, 32), 3.7, 40.0, 0.8)),
+        _scene(_one((47, 31), 4.0, 40.0, 0.8, RED), _one((90, 30), 3.7, 40.0, 0.8)),
     ),
     Probe(
         "equal",
@@ -153,29 +156,35 @@ PROBES = (
         _scene(_one((50, 30), 4, (7.0, 2.0, 4.0), 0.9, WHITE, TURNED)),
         cam_from_world=((0.98, 0.05, -0.1, 0.1), np.array([0.2, -0.1, 0.3])),
     ),
-    Probe("crowd", "all of it: forty Gaussians", _crowd()),
+    Probe("crowd", "all of it: forty Gaussians", _crowd(), is_single=False),
 )
 
 
-def write(probe: Probe, folder: Path, n_more: int = 0) -> dict[str, Any]:
-    """Write a probe's PLY into a folder, and return the request of the contract.
+def with_unseen(probe: Probe, n_more: int) -> Gaussians:
+    """Return a probe's Gaussians, and black ones of little opacity in a corner, for viewers that need some.
 
-    ``n_more`` black Gaussians of little opacity are added in a corner, for viewers that need some.
+    They are so far behind, and to the lower right, that GaussianSplats3D has them last in its buffer, and loses one.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{probe.name}.ply"
     last = Gaussians._make(field[-1:].copy() for field in probe.gaussians)
     R, t = probe.camera
-    corner = np.array([(1 - probe.centre[0]) / FOCAL, (1 - probe.centre[1]) / FOCAL, 1.0]) * 4.0
-    hidden = last._replace(
-        means=((corner - t) @ R)[None].astype(np.float32),
+    corner = np.array([(WIDTH - 1 - probe.centre[0]) / FOCAL, (HEIGHT - 1 - probe.centre[1]) / FOCAL, 1.0])
+    unseen = last._replace(
+        means=((UNSEEN_DEPTH * corner - t) @ R)[None].astype(np.float32),
         log_scales=np.full((1, 3), -7, np.float32),
         opacity_logits=np.array([UNSEEN], np.float32),
         sh_dc=np.full((1, 3), -0.5 / SH_C0, np.float32),
         sh_rest=0 * last.sh_rest,
     )
-    rows = [probe.gaussians, *[hidden] * n_more]
-    save_ply(path, Gaussians._make(np.concatenate(fields) for fields in zip(*rows, strict=True)))
+    rows = [probe.gaussians, *[unseen] * n_more]
+    return Gaussians._make(np.concatenate(fields) for fields in zip(*rows, strict=True))
+
+
+def write(probe: Probe, folder: Path, n_more: int = 0) -> dict[str, Any]:
+    """Write a probe's PLY with ``n_more`` unseen Gaussians into a folder, and return the request of the contract."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{probe.name}.ply"
+    save_ply(path, with_unseen(probe, n_more))
+    R, t = probe.camera
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = R, t
     request = {
@@ -192,6 +201,11 @@ def write(probe: Probe, folder: Path, n_more: int = 0) -> dict[str, Any]:
     }
     (folder / f"{probe.name}.json").write_text(json.dumps(request))
     return request
+
+
+def camera_of(probe: Probe) -> Camera:
+    """Return the camera of a probe."""
+    return Camera(*probe.camera, FOCAL, FOCAL, *probe.centre, WIDTH, HEIGHT)
 
 
 def golden_of(probe: Probe, conventions: Conventions) -> Golden:

@@ -1,19 +1,18 @@
-"""The renderers that are compared: where each comes from, in which version, and what runs it.
+"""The renderers that are compared: where each comes from, in which version, what runs it, and by which rules.
 
-A viewer is a package of npm and a driver. A renderer that cannot be run has the reason, and the command that was tried.
+A viewer is a package of npm or a repository, and a driver. Its habits are what its source states; the reference that
+follows them is compared with its pictures. A renderer that cannot be run has the reason, and the command tried.
 """
 
-import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from data_tools.conformance.probes import HEIGHT, WIDTH, Probe, golden_of
+from data_tools.conformance import programs
+from data_tools.conformance.habits import SQRT_8, VIEWER, Habits
+from data_tools.conformance.probes import Probe
+from data_tools.conformance.storing import BYTES, COMPACT, PACKED, SPLAT, SPLAT_AND_HARMONICS
 from minisplat_ref.constants import GSPLAT_1_5
-from minisplat_ref.errors import InputError
-from minisplat_ref.oracle.golden.format import STAGE_INPUTS
 from minisplat_ref.types import Floats
 
 MODULES = "/node_modules"
@@ -21,50 +20,43 @@ THREE = {
     "three": f"{MODULES}/three/build/three.module.js",
     "three/addons/": f"{MODULES}/three/examples/jsm/",
 }
+QUARTER = 0.3 / 4  # px^2, a low-pass that is added to four times the covariance
+HALF_OF_HALVES = (2.0**15) ** 0.5 / 2  # four times its square is half of what half precision holds, and made infinite
+OF_QUADS = VIEWER._replace(alpha_min=0.0)
 
 
 class Renderer(NamedTuple):
-    """Who is compared."""
+    """A renderer that is compared."""
 
     name: str
     what: str
     version: str
+    habits: Habits | None = None
+    """Its rules."""
     packages: tuple[str, ...] = ()
     """Of npm, with their versions."""
+    wheels: tuple[str, ...] = ()
+    """Of PyPI, with their versions."""
+    repository: tuple[str, str] | None = None
+    """Of GitHub, and the commit."""
     driver: str = ""
     """Of a viewer, in ``viewers/``."""
     imports: Mapping[str, str] = {}
     """Where the driver finds what it imports."""
-    render: Callable[[Probe], Floats] | None = None
-    """Returns the picture [H, W, 3] of a probe, for those that are Python."""
+    render: Callable[[Probe, Path], Floats] | None = None
+    """Returns the picture [H, W, 3] of a probe with the cache folder, for those that are Python."""
     n_more: int = 0
     """Gaussians that nobody sees, which it needs beside those of a probe."""
     reason: str = ""
     """Why it is not run, with what was tried."""
 
-
-def _gsplat_torch(probe: Probe) -> Floats:
-    """Render by gsplat's own functions in torch, with the blending of docs/ORACLE.md.
-
-    Raises
-    ------
-    InputError
-        They are not installed.
-    """
-    try:
-        from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
-    except ImportError as error:
-        raise InputError("gsplat's torch functions need torch and gsplat: pip install torch gsplat==1.5.3") from error
-    from minisplat_ref.oracle.golden.running import run_stages
-
-    scene = golden_of(probe, GSPLAT_1_5)
-    image = run_stages(gsplat_torch(), scene._replace(arrays=inputs_of(scene.arrays)), "float32")["image"]
-    return np.asarray(np.rint(255 * np.clip(image, 0, 1)) / 255).reshape(HEIGHT, WIDTH, 3)
-
-
-def inputs_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays that a renderer is given."""
-    return {name: arrays[name] for name in (*STAGE_INPUTS["view"], "features", "feature_background")}
+    @property
+    def source(self) -> str:
+        """Return how it is fetched."""
+        ways = [f"npm install {' '.join(self.packages)}"] if self.packages else []
+        ways += [f"git clone https://github.com/{self.repository[0]}"] if self.repository else []
+        ways += [f"pip install {' '.join(self.wheels)}"] if self.wheels else []
+        return ", ".join(f"`{way}`" for way in ways)
 
 
 RENDERERS = (
@@ -72,25 +64,58 @@ RENDERERS = (
         "spark",
         "Spark, a viewer on three.js",
         "2.2.0",
-        ("@sparkjsdev/spark@2.2.0", "three@0.180.0"),
-        "spark.js",
-        {**THREE, "@sparkjsdev/spark": f"{MODULES}/@sparkjsdev/spark/dist/spark.module.js"},
+        Habits(
+            VIEWER._replace(is_antialiased=True, alpha_min=0.5 / 255),
+            deviations=SQRT_8,
+            storage=PACKED,
+            beyond=1.4,
+            widest=512 / SQRT_8,
+            has_distances=True,
+            is_last_first=True,
+            has_free_slopes=True,
+        ),
+        packages=("@sparkjsdev/spark@2.2.0", "three@0.180.0"),
+        driver="spark.js",
+        imports={**THREE, "@sparkjsdev/spark": f"{MODULES}/@sparkjsdev/spark/dist/spark.module.js"},
     ),
     Renderer(
         "playcanvas",
         "PlayCanvas' engine, which SuperSplat shows",
         "2.23.3",
-        ("playcanvas@2.23.3",),
-        "playcanvas.js",
-        {"playcanvas": f"{MODULES}/playcanvas/build/playcanvas.mjs"},
+        Habits(
+            VIEWER._replace(eps2d=QUARTER),
+            deviations=SQRT_8,
+            is_lowered=True,
+            storage=COMPACT,
+            widest=64 / SQRT_8,  # the shorter side of the image
+            narrowest=0.1 / 4,
+            least_size=1 / SQRT_8,
+            has_free_slopes=True,
+        ),
+        packages=("playcanvas@2.23.3",),
+        driver="playcanvas.js",
+        imports={"playcanvas": f"{MODULES}/playcanvas/build/playcanvas.mjs"},
     ),
     Renderer(
         "mkkellogg",
         "GaussianSplats3D, a viewer on three.js",
         "0.4.7",
-        ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.180.0"),
-        "mkkellogg.js",
-        {
+        Habits(
+            OF_QUADS,
+            deviations=SQRT_8,
+            storage=BYTES,
+            is_last_first=True,
+            beyond=1.2,
+            widest=1024 / SQRT_8,
+            least_root=0.1**0.5,
+            axis_epsilon=0.0,
+            degree=2,
+            color_max=1.0,
+            has_free_slopes=True,
+        ),
+        packages=("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.180.0"),
+        driver="mkkellogg.js",
+        imports={
             **THREE,
             "@mkkellogg/gaussian-splats-3d": (
                 f"{MODULES}/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js"
@@ -102,48 +127,117 @@ RENDERERS = (
         "gsplatjs",
         "gsplat.js, a viewer of its own",
         "1.2.9",
-        ("gsplat@1.2.9",),
-        "gsplatjs.js",
-        {"gsplat": f"{MODULES}/gsplat/dist/index.es.js"},
+        Habits(
+            OF_QUADS._replace(eps2d=QUARTER, uses_principal_point=False),
+            deviations=SQRT_8,
+            storage=SPLAT,
+            beyond=1.2,
+            widest=512 / 2**0.5,
+            has_free_slopes=True,
+            largest_scale=HALF_OF_HALVES,
+            is_in_file_order=True,
+            axis_epsilon=0.0,
+        ),
+        packages=("gsplat@1.2.9",),
+        driver="gsplatjs.js",
+        imports={"gsplat": f"{MODULES}/gsplat/dist/index.es.js"},
     ),
-    Renderer("gsplat-torch", "gsplat's functions in torch, blended here", "1.5.3", render=_gsplat_torch),
     Renderer(
-        "antimatter15", "antimatter15/splat", "ba182b51", reason="no driver yet: it reads .splat and its own camera"
+        "antimatter15",
+        "splat, antimatter15's viewer",
+        "ba182b51",
+        Habits(
+            OF_QUADS._replace(eps2d=0.0, uses_principal_point=False),
+            deviations=SQRT_8,
+            storage=SPLAT,
+            beyond=1.2,
+            widest=512 / 2**0.5,
+            has_free_slopes=True,
+            largest_scale=HALF_OF_HALVES,
+            fades_at=0.2,
+            axis_epsilon=0.0,
+        ),
+        repository=("antimatter15/splat", "ba182b51"),
+        driver="antimatter15.js",
     ),
-    Renderer("babylon", "Babylon.js", "9.35.0", reason="no driver yet: npm install @babylonjs/core@9.35.0 works"),
-    Renderer("viser", "viser's splats", "1.1.1", reason="no driver yet: its page is fed by a websocket"),
+    Renderer(
+        "babylon",
+        "Babylon.js",
+        "9.35.0",
+        Habits(
+            OF_QUADS._replace(eps2d=QUARTER),
+            deviations=SQRT_8,
+            storage=SPLAT_AND_HARMONICS,
+            axis_epsilon=1e-4,
+            beyond=1.2,
+            widest=512 / 2**0.5,
+            has_free_slopes=True,
+        ),
+        packages=("@babylonjs/core@9.35.0",),
+        driver="babylon.js",
+        imports={"@babylonjs/core/": f"{MODULES}/@babylonjs/core/"},
+    ),
+    Renderer(
+        "gsplat-torch",
+        "gsplat's functions in torch, blended here",
+        "1.5.3",
+        Habits(GSPLAT_1_5),
+        wheels=("gsplat==1.5.3", "torch==2.13.0"),
+        render=programs.gsplat_torch,
+    ),
+    Renderer(
+        "torch-splatting",
+        "torch-splatting",
+        "3fa49bd6",
+        Habits(
+            VIEWER._replace(alpha_min=0.0, alpha_max=0.99, near_plane=0.2, uses_principal_point=False),
+            has_raw_directions=True,
+            white_tiles=64,
+        ),
+        wheels=("torch==2.13.0", "einops"),
+        repository=programs.TORCH_SPLATTING,
+        render=programs.torch_splatting,
+    ),
+    Renderer(
+        "opensplat",
+        "OpenSplat's rasteriser on a CPU",
+        "15b7e800",
+        Habits(GSPLAT_1_5._replace(uses_principal_point=False, clamp_is_symmetric=True), box=(3.0, 2)),
+        wheels=("torch==2.13.0",),
+        repository=programs.OPENSPLAT,
+        render=programs.opensplat,
+    ),
+    Renderer(
+        "litesplat",
+        "LiteSplat, in Keras on torch",
+        "0.1.1",
+        Habits(
+            VIEWER._replace(eps2d=0.0, alpha_min=0.0, near_plane=1e-8),
+            centres=(0.0, 1.0),  # y up in its image, from 0 at the lowest row
+            degree=0,
+            has_free_slopes=True,
+            has_distances=True,
+        ),
+        wheels=("litesplat==0.1.1", "torch==2.13.0"),
+        render=programs.litesplat,
+    ),
+    Renderer(
+        "viser",
+        "viser's splats",
+        "1.1.1",
+        reason="no driver: its page is fed by a websocket from Python, which was not tried; its shader is that of splat"
+        " with a low-pass of 0.3",
+    ),
     Renderer("three", "three.js by itself", "0.187.0", reason="has no splats of its own"),
     Renderer(
-        "opensplat", "OpenSplat's rasteriser on a CPU", "1.2.0", reason="not tried yet: needs libtorch and a build"
+        "taichi-splatting",
+        "taichi-splatting",
+        "0.13.0",
+        reason=(
+            "`pip install taichi==1.7.4 taichi-splatting`, and its import compiles CUDA for its sort: "
+            "CUDA_HOME environment variable is not set"
+        ),
     ),
-    Renderer("taichi-splatting", "taichi-splatting", "", reason="not tried yet"),
     Renderer("gsplat", "gsplat's CUDA kernels", "1.5.3", reason="needs a CUDA card"),
     Renderer("inria", "the 3DGS rasteriser", "", reason="needs a CUDA card and a build"),
 )
-
-
-def install(renderer: Renderer, cache: Path) -> None:
-    """Fetch a viewer's packages into a folder, unless they are there.
-
-    Raises
-    ------
-    InputError
-        npm failed.
-    """
-    missing = [package for package in renderer.packages if not _has(package, cache)]
-    if not missing:
-        return
-    cache.mkdir(parents=True, exist_ok=True)
-    command = ["npm", "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(cache), *missing]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise InputError(f"{renderer.name} is a package of npm, which is not installed: {error}") from error
-    if done.returncode:
-        raise InputError(f"{' '.join(command)} failed: {done.stderr.strip().splitlines()[-1:]}")
-
-
-def _has(package: str, cache: Path) -> bool:
-    name, _, version = package.rpartition("@")
-    file = cache / "node_modules" / name / "package.json"
-    return file.is_file() and f'"version": "{version}"' in file.read_text(encoding="utf-8")

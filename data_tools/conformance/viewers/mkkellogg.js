@@ -17,6 +17,8 @@ export async function show(request) {
     splatAlphaRemovalThreshold: 0, showLoadingUI: false, progressiveLoad: false, format: Splats.SceneFormat.Ply,
   });
   for (let k = 0; k < 100 && !(viewer.splatRenderReady && k > 10); k++) { viewer.update(); viewer.render(); await later(0.1); }
-  viewer.update(); viewer.render();
+  viewer.update();
+  viewer.splatMesh.updateVisibleRegionFadeDistance(Splats.SceneRevealMode.Instant);  // without its fading in
+  viewer.render();
   return pixels(drawn.getContext(), request);
 }

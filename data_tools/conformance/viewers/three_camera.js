@@ -12,7 +12,7 @@ export function renderer(request) {
 }
 
 export function camera(request) {
-  const made = new THREE.PerspectiveCamera(50, request.width / request.height, 0.05, 500);
+  const made = new THREE.PerspectiveCamera(2 * Math.atan(request.height / 2 / request.fy) * 180 / Math.PI, request.width / request.height, 0.05, 500);
   made.projectionMatrix.fromArray(projection(request));
   made.projectionMatrixInverse.copy(made.projectionMatrix).invert();
   made.updateProjectionMatrix = () => {};
