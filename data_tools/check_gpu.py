@@ -1,9 +1,9 @@
 """``python -m data_tools.check_gpu``: everything that the backend cuda promises, on a machine with an NVIDIA GPU.
 
-It runs the oracle and the hard cases, trains with every recipe, compares the bytes of repeated gradients, times both
-passes beside gsplat's where that is installed, and prints one JSON with the card's name and its driver. Without a GPU
-it says so in one line and ends with exit code 2. With ``NUMBA_ENABLE_CUDASIM=1`` the simulator takes the GPU's place,
-for the test of this file; then it times nothing.
+It runs the oracle and the hard cases, trains with every recipe, compares the bytes of repeated gradients, counts what
+both passes ask of the device, times them beside gsplat's where that is installed, and prints one JSON with the card's
+name and its driver. Without a GPU it says so in one line and ends with exit code 2. With ``NUMBA_ENABLE_CUDASIM=1`` the
+simulator takes the GPU's place, for the test of this file; then it times nothing.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.device_work import count_work
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.errors import InputError
@@ -26,13 +27,13 @@ from minisplat_ref.oracle.comparison.renderers import choose_renderer, choose_sc
 from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 from minisplat_ref.oracle.hard_cases import HARD_CASES
 from minisplat_ref.oracle.hard_cases.run import Precision, run_hard_cases, select_cases
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import activate, render
 from minisplat_ref.rendering.backends import BACKENDS, CUDA, CUDA_ATOMIC, Backend, get_backend
 from minisplat_ref.training.loop import train
-from minisplat_ref.types import Camera, Floats, Gaussians, Primitives, ProjectionGradient, Scene, TileGrid, View
+from minisplat_ref.types import Camera, Floats, Gaussians, Primitives, Scene, TileGrid, View
 
 DESCRIPTION = "Check everything that the backend cuda promises, on a machine with an NVIDIA GPU; print one JSON."
-PARTS = ("oracle", "hard_cases", "recipes", "bytes", "speed")
+PARTS = ("oracle", "hard_cases", "recipes", "bytes", "work", "speed")
 GSPLAT_FACTOR = 3.0  # both passes should take at most this many times gsplat's
 
 
@@ -115,30 +116,29 @@ class Passes:
     def __init__(self, backend: Backend, n: int, size: tuple[int, int]) -> None:
         self.backend, self.device, self.camera = backend, backend.residence, make_camera(*size)
         self.gaussians = self.device.to_device(make_gaussians(n))
-        self.background = np.zeros(3, np.float32)
+        self._passes = self.device.Passes(backend.is_deterministic)
+        self._options = self.device.Options(np.zeros(3, np.float32), 3, GSPLAT_MAIN)
+        self._no_alpha = self.device.zeros(size[::-1], np.float32)
+        while self._passes.count_pairs(tape := self.forward()) > tape.capacity:
+            pass
 
     def forward(self) -> Any:
         """Return everything that the backward pass reads."""
-        b, g, camera = self.backend, self.gaussians, self.camera
-        primitives: Primitives = self.device.activate(g, None)
-        projection = b.project(*primitives, camera, GSPLAT_MAIN)
-        colors = b.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, 3, projection.radii)
-        grid = TileGrid(camera.width, camera.height, b.tile_width, b.tile_height)
-        bins = b.bin_gaussians(projection, grid, GSPLAT_MAIN)
-        return primitives, projection, colors, bins, b.composite(projection, colors, self.background, bins, GSPLAT_MAIN)
+        return self._passes.render(self.gaussians, self.camera, self._options)
 
     def backward(self, tape: Any) -> Gaussians:
         """Return the gradient of half the sum of squares of the image."""
-        b, g, camera = self.backend, self.gaussians, self.camera
-        primitives: Primitives = tape[0]
-        _, p, colors, bins, output = tape
-        blended = p, colors, self.background, bins, GSPLAT_MAIN, output
-        v = b.composite_vjp(*blended, output.image, self.device.zeros(output.alpha.shape, np.float32))
-        v_depths = self.device.zeros((len(g.means), 1), np.float32).reshape(len(g.means))
-        v_projection = ProjectionGradient(v.means2d, v_depths, v.conics, v.opacities)
-        v_primitives = b.project_vjp(*primitives, camera, GSPLAT_MAIN, p, v_projection)
-        v_sh = b.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, 3, p.radii, v.colors)
-        return self.device.chain(g, primitives, v_primitives, v_sh)
+        return self._passes.render_vjp(tape, tape.output.image, self._no_alpha).gaussians
+
+
+def count_passes(passes: Passes) -> dict[str, Any]:
+    """Return what both passes ask of the device once their arrays are there."""
+    passes.backward(passes.forward())
+    with count_work() as forward:
+        tape = passes.forward()
+    with count_work() as backward:
+        passes.backward(tape)
+    return {"forward": forward.as_counts(), "backward": backward.as_counts()}
 
 
 def compare_bytes(passes: Passes, n_runs: int) -> dict[str, Any]:
@@ -172,23 +172,24 @@ def time_passes(passes: Passes, repeats: int) -> dict[str, float]:
     return {"forward_ms": forward, "backward_ms": median_ms(lambda: passes.backward(tape), synchronize, repeats)}
 
 
-def time_stages(passes: Passes, repeats: int) -> dict[str, float]:
+def time_stages(backend: Backend, n: int, size: tuple[int, int], repeats: int) -> dict[str, float]:
     """Time the stages of a view one by one, in ms; between two of them the host waits for the device."""
-    b, g, camera = passes.backend, passes.gaussians, passes.camera
-    tape = passes.forward()
-    primitives: Primitives = tape[0]
-    _, p, colors, bins, output = tape
-    grid, no_alpha = bins.grid, passes.device.zeros(output.alpha.shape, np.float32)
-    blended = p, colors, passes.background, bins, GSPLAT_MAIN
-    harmonics = g.means, g.sh_dc, g.sh_rest, camera, 3, p.radii
+    b, device, camera, g = backend, backend.residence, make_camera(*size), make_gaussians(n)
+    primitives: Primitives = device.to_device(activate(g))
+    means, sh_dc, sh_rest = map(device.to_device, (g.means, g.sh_dc, g.sh_rest))
+    harmonics = means, sh_dc, sh_rest, camera, 3
+    p = b.project(*primitives, camera, GSPLAT_MAIN)
+    grid = TileGrid(camera.width, camera.height, b.tile_width, b.tile_height)
+    blended = p, b.sh_colors(*harmonics, p.radii), np.zeros(3, np.float32), b.bin_gaussians(p, grid, GSPLAT_MAIN)
+    output, no_alpha = b.composite(*blended, GSPLAT_MAIN), device.zeros(size[::-1], np.float32)
     stages: dict[str, Callable[[], Any]] = {
         "project": lambda: b.project(*primitives, camera, GSPLAT_MAIN),
-        "colours": lambda: b.sh_colors(*harmonics),
+        "colours": lambda: b.sh_colors(*harmonics, p.radii),
         "lists": lambda: b.bin_gaussians(p, grid, GSPLAT_MAIN),
-        "blend": lambda: b.composite(*blended),
-        "blend_vjp": lambda: b.composite_vjp(*blended, output, output.image, no_alpha),
+        "blend": lambda: b.composite(*blended, GSPLAT_MAIN),
+        "blend_vjp": lambda: b.composite_vjp(*blended, GSPLAT_MAIN, output, output.image, no_alpha),
     }
-    return {name: median_ms(stage, passes.device.synchronize, repeats) for name, stage in stages.items()}
+    return {name: median_ms(stage, device.synchronize, repeats) for name, stage in stages.items()}
 
 
 def time_gsplat(n: int, size: tuple[int, int], repeats: int) -> dict[str, Any]:
@@ -226,6 +227,7 @@ def check(args: argparse.Namespace) -> dict[str, Any]:
         "hard_cases": lambda: run_hard(args.cases, deterministic),
         "recipes": lambda: run_recipes(args, deterministic),
         "bytes": lambda: {b.name: compare_bytes(Passes(b, *view), args.runs) for b in (deterministic, atomic)},
+        "work": lambda: {b.name: count_passes(Passes(b, *view)) for b in (deterministic, atomic)},
         "speed": lambda: run_speed(args, (deterministic, atomic)),
     }
     view = args.gaussians, args.size
@@ -240,7 +242,7 @@ def run_speed(args: argparse.Namespace, backends: tuple[Backend, ...]) -> dict[s
         return {"not_timed": "the simulator's times say nothing"}
     view = args.gaussians, args.size
     ours = {backend.name: time_passes(Passes(backend, *view), args.repeats) for backend in backends}
-    stages = time_stages(Passes(backends[0], *view), args.repeats)
+    stages = time_stages(backends[0], *view, args.repeats)
     others = {"stages_ms": stages, "gsplat": time_gsplat(*view, args.repeats)}
     return {"n_gaussians": view[0], "size": list(view[1]), **ours, **others}
 

@@ -40,8 +40,8 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing import plain
 from minisplat_ref.cuda.compositing import tiles
 from minisplat_ref.cuda.compositing.forward import forward_kernel
+from minisplat_ref.cuda.footprints import TILE
 from minisplat_ref.cuda.target import WARP
-from minisplat_ref.cuda.tiling import TILE
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering.backends import REFERENCE, get_backend
 from minisplat_ref.types import Projection, TileGrid
@@ -113,7 +113,7 @@ show_code(plain.forward_kernel.__wrapped__)
 # |---|---|
 # | `state`: transmittance and colour, eight numbers each | `T` and `color`: registers of a thread |
 # | `for m in row.members`: the row's own list | `for j in range(n_listed)`: the tile's list, for all threads |
-# | `hit_row(hit, primitives, n, row)` | `hit(batch, j, ...)`: records from shared memory, 32 at a time |
+# | `hit_row(hit, primitives, n, row)` | `hit(batch, j, ...)`: records from shared memory, up to 256 at a time |
 # | `blend(T, unclamped, frame)` | the same function |
 # | `if not reduce_any(T > ZERO): break` | `syncthreads_count(T > 0) == 0`: nobody in the block is open |
 #
@@ -137,8 +137,8 @@ axis.set(xlabel="thread; blue lines part the warps", ylabel="place in the list",
 plt.show()
 
 # %% [markdown]
-# `read_batch` is why a block is worth it. Its threads copy 32 records together, wait until all have, and then read each
-# record 256 times from memory that is as near as registers.
+# `read_batch` is why a block is worth it. Its threads copy a batch of records together, wait until all have, and then
+# read each record 256 times from memory that is as near as registers.
 
 # %%
 show_code(tiles.read_batch.fn if hasattr(tiles.read_batch, "fn") else tiles.read_batch)

@@ -1,10 +1,11 @@
 """The optimiser step on one array: a thread for each number."""
 
+import functools
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.cuda.arrays import is_on_device, to_device, to_host
+from minisplat_ref.cuda.arrays import empty, is_on_device, to_device, to_host
 from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
 from minisplat_ref.scalar.adam import Step, adam_value
 from minisplat_ref.types import AdamStep, Floats, Ints
@@ -56,6 +57,11 @@ def adam_update(
 
 def list_on_device(numbers: Ints | None) -> Any:
     """Return a list of int32 on the device, an empty one for None."""
-    if is_on_device(numbers):
-        return numbers
-    return to_device(np.empty(0, np.int32) if numbers is None else np.asarray(numbers, np.int32))
+    if numbers is None:
+        return _no_numbers()
+    return numbers if is_on_device(numbers) else to_device(np.asarray(numbers, np.int32))
+
+
+@functools.cache
+def _no_numbers() -> Any:
+    return empty(0, np.int32)

@@ -59,8 +59,13 @@ def clear_rows(table):
             table[n, k] = ZERO
 
 
+def write_zeros(table: Any) -> None:
+    """Set a table [N, W] of the device to zero."""
+    launch_rows(clear_rows, table.shape[0], table)
+
+
 def zeros(shape: tuple[int, int], dtype: Any) -> Floats:
     """Return a table of zeros on the device."""
     table = empty(shape, dtype)
-    launch_rows(clear_rows, shape[0], table)
+    write_zeros(table)
     return table

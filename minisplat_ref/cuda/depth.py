@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.cpu.depth import Ellipsoids, PixelLists, pack_intrinsics
-from minisplat_ref.cpu.projection import pack_pose
 from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host
-from minisplat_ref.cuda.projection import store_triple, wide_quaternion, wide_triple
+from minisplat_ref.cuda.projection import pass_pose, store_triple, wide_quaternion, wide_triple
 from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch_rows
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.covariance import normalize, normalize_vjp, rotation_vjp
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
-from minisplat_ref.scalar.projection import dot, matrix_rows, transpose3
+from minisplat_ref.scalar.projection import dot, transpose3
 from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
 
 
@@ -50,7 +49,7 @@ def write_points(
     y = i // width
     x = i - y * width
     n, t = dominant_ids[y, x], np.float64(0)
-    d = ray(matrix_rows(pose.R), intrinsics, x, y)
+    d = ray(pose.R, intrinsics, x, y)
     if n >= 0:
         axes = gaussian_axes(wide_quaternion(quats, n))
         t = densest_depth(axes, wide_triple(scales, n), offset(means, n, pose.centre), d)
@@ -83,7 +82,7 @@ def write_points_vjp(
     n = cuda.grid(1)
     if n >= offsets.shape[0] - 1:
         return
-    R, width = matrix_rows(pose.R), depths.shape[1]
+    R, width = pose.R, depths.shape[1]
     quat, scale = wide_quaternion(ellipsoids.quats, n), wide_triple(ellipsoids.scales, n)
     axes, u = gaussian_axes(quat), offset(ellipsoids.means, n, pose.centre)
     sums = cuda.local.array((5, 3), np.float64)  # of the three axes, the mean and the scales
@@ -151,4 +150,4 @@ def surface_points_vjp(
 
 def _scene(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> tuple[Any, Any, Any]:
     """Return the Gaussians, the pose and the intrinsics as kernels read them."""
-    return to_device(Ellipsoids(means, quats, scales)), to_device(pack_pose(camera)), to_device(pack_intrinsics(camera))
+    return to_device(Ellipsoids(means, quats, scales)), pass_pose(camera), tuple(pack_intrinsics(camera))

@@ -7,14 +7,15 @@ means. A second kernel filters these likewise. One half is subtracted as on the 
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.cpu.loss import LossTape
-from minisplat_ref.cuda.arrays import beside, empty, is_on_device, to_device, to_host
+from minisplat_ref.cuda.arrays import beside, is_on_device, to_device, to_host
 from minisplat_ref.cuda.compositing.tiles import BLOCK, N_WARPS
+from minisplat_ref.cuda.footprints import TILE
 from minisplat_ref.cuda.target import (
     GpuKernel,
     cuda,
@@ -24,7 +25,7 @@ from minisplat_ref.cuda.target import (
     launch,
     reduce_warps,
 )
-from minisplat_ref.cuda.tiling import TILE
+from minisplat_ref.cuda.workspace import Workspace
 from minisplat_ref.jit.lanes import select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.scalar.loss import photometric_vjp, ssim_and_derivatives
@@ -213,31 +214,81 @@ def gradient_kernel(dtype: np.dtype) -> GpuKernel:
     return similarity_tiles_vjp
 
 
+class Photograph(NamedTuple):
+    """A photograph on the device."""
+
+    target: Floats | Ints
+    """[H, W, 3]."""
+    mask: Bools
+    """[H, W] True where a pixel counts; [1, 1] True where all do."""
+    n_values: int
+    """Numbers that count."""
+
+
+class Comparison(NamedTuple):
+    """What comparing an image with a photograph gives, on the device."""
+
+    sums: Floats
+    """[n_tiles, 2] of |I - T| and of SSIM."""
+    v_image: Floats
+    """[H, W, 3] gradient of the loss."""
+
+
+@functools.cache
+def _everywhere() -> Any:
+    return to_device(np.ones((1, 1), bool))
+
+
+@functools.cache
+def _window_on_device(dtype: np.dtype) -> Any:
+    return to_device(window_weights(dtype))
+
+
+def prepare_photograph(target: Floats | Ints, mask: Bools | None) -> Photograph:
+    """Return a photograph, on the host or the device, with its mask on the device."""
+    counted = target.size if mask is None else N_CHANNELS * int(np.count_nonzero(to_host(mask)))
+    return Photograph(to_device(target), _everywhere() if mask is None else to_device(mask), counted)
+
+
+def compare(workspace: Workspace, image: Floats, photograph: Photograph, dssim_weight: float) -> Comparison:
+    """Compare an image on the device with a photograph; see :func:`photometric_loss`."""
+    (height, width, _), dtype = image.shape, image.dtype
+    target, mask, n_values = photograph
+    unit = dtype.type(1 / 255 if target.dtype == np.uint8 else 1)
+    pair, window, n_tiles = Pair(image, target, unit, mask), _window_on_device(dtype), n_image_tiles(width, height)
+    derivatives = workspace.array("ssim_derivatives", (N_DERIVATIVES, *image.shape), dtype)
+    found = Comparison(
+        workspace.array("loss_sums", (n_tiles, 2), dtype), workspace.array("v_image", image.shape, dtype)
+    )
+    launch(similarity_kernel(dtype), n_tiles, BLOCK, pair, window, derivatives, found.sums)
+    share = 1 / max(n_values, 1)  # where nothing counts the gradient is zero
+    factors = dtype.type((1 - dssim_weight) * share), dtype.type(-dssim_weight * share)
+    launch(gradient_kernel(dtype), n_tiles, BLOCK, pair, window, derivatives, factors, found.v_image)
+    return found
+
+
+def n_image_tiles(width: int, height: int) -> int:
+    """Return the number of tiles of an image."""
+    return -(-height // TILE) * -(-width // TILE)
+
+
+def read_loss(comparison: Comparison, n_values: int, dssim_weight: float) -> float:
+    """Return the loss, for which the host waits."""
+    if n_values == 0:
+        return 0.0
+    l1, ssim = to_host(comparison.sums).sum(axis=0, dtype=np.float64) / n_values
+    return float((1 - dssim_weight) * l1 + dssim_weight * (1 - ssim))
+
+
 def photometric_loss(
     image: Floats, target: Floats | Ints, dssim_weight: float, mask: Bools | None = None
 ) -> tuple[float, LossTape]:
     """Return (1 - w) mean |I - T| + w (1 - mean SSIM); see ``reference.loss.photometric_loss``."""
-    (height, width, _), dtype = image.shape, image.dtype
-    n_values = image.size if mask is None else N_CHANNELS * int(np.count_nonzero(to_host(mask)))
-    if n_values == 0:
-        return 0.0, LossTape(beside(image, to_device(np.zeros(image.shape, dtype))))
-    pair = to_device(
-        Pair(
-            image,
-            target,
-            dtype.type(1 / 255 if target.dtype == np.uint8 else 1),
-            np.ones((1, 1), bool) if mask is None else mask,
-        )
-    )
-    n_tiles = -(-height // TILE) * -(-width // TILE)
-    window = to_device(window_weights(dtype))
-    derivatives, sums = empty((N_DERIVATIVES, *image.shape), dtype), empty((n_tiles, 2), dtype)
-    v_image = empty(image.shape, dtype)
-    launch(similarity_kernel(dtype), n_tiles, BLOCK, pair, window, derivatives, sums)
-    factors = dtype.type((1 - dssim_weight) / n_values), dtype.type(-dssim_weight / n_values)
-    launch(gradient_kernel(dtype), n_tiles, BLOCK, pair, window, derivatives, factors, v_image)
-    l1, ssim = to_host(sums).sum(axis=0, dtype=np.float64) / n_values
-    return float((1 - dssim_weight) * l1 + dssim_weight * (1 - ssim)), LossTape(beside(image, v_image))
+    photograph = prepare_photograph(target, mask)
+    if photograph.n_values == 0:
+        return 0.0, LossTape(beside(image, to_device(np.zeros(image.shape, image.dtype))))
+    found = compare(Workspace(), to_device(image), photograph, dssim_weight)
+    return read_loss(found, photograph.n_values, dssim_weight), LossTape(beside(image, found.v_image))
 
 
 def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:

@@ -14,6 +14,7 @@ from minisplat_ref.cuda.target import ROW_THREADS, cuda, device_function, gpu_ke
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import Extent, inria_box, is_seen, support_box
 from minisplat_ref.scalar.projection import (
+    Pose,
     axes,
     axes_vjp,
     compensation_vjp,
@@ -21,7 +22,6 @@ from minisplat_ref.scalar.projection import (
     conic_vjp,
     dot,
     matmul3,
-    matrix_rows,
     project_gaussian,
     project_gaussian_vjp,
     to_camera,
@@ -30,6 +30,17 @@ from minisplat_ref.scalar.projection import (
 from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Primitives, Projection, ProjectionGradient
 
 N_POSE = 12  # numbers of a pose: three rows of R and t
+
+
+def pass_pose(camera: Camera) -> Pose:
+    """Return the pose as tuples of numbers, which are passed to a kernel without a copy to the device."""
+    R, centre = pack_pose(camera)
+    return Pose(tuple(map(tuple, R)), tuple(centre))  # type: ignore[arg-type]
+
+
+def pack_extent(camera: Camera, conventions: Conventions, dtype: np.dtype) -> Extent:
+    """Return the size of the image and how far a Gaussian reaches in it."""
+    return Extent(dtype.type(conventions.alpha_min), conventions.has_full_support, camera.width, camera.height)
 
 
 @device_function
@@ -52,6 +63,21 @@ def store_triple(table, n, values):
     table[n, 2] = values[2]
 
 
+@device_function
+def project_one(mean, quat, scale, opacity, pose, constants, extent):
+    """Return whether a Gaussian is seen, its depth, footprint, conic, opacity there and reach (radii, box)."""
+    p = to_camera(pose.R, pose.centre, mean[0], mean[1], mean[2])
+    footprint = project_gaussian(p, matmul3(pose.R, axes(quat, scale)), constants)
+    dimmed = opacity * footprint.compensation
+    abc = conic(footprint)
+    if extent.has_full_support:
+        reach = support_box(footprint, dimmed, extent.alpha_min, extent.width, extent.height)
+    else:
+        reach = inria_box(footprint, extent.width, extent.height)
+    seen = is_seen(p[2], dimmed, footprint, abc, reach, extent.alpha_min, constants)
+    return seen, p[2], footprint, abc, dimmed, reach
+
+
 @gpu_kernel
 def project_rows(
     primitives,  # Primitives
@@ -64,22 +90,14 @@ def project_rows(
     n = cuda.grid(1)
     if n >= primitives.opacities.shape[0]:
         return
-    R = matrix_rows(pose.R)
-    x, y, z = wide_triple(primitives.means, n)
-    p = to_camera(R, pose.centre, x, y, z)
-    M = axes(wide_quaternion(primitives.quats, n), wide_triple(primitives.scales, n))
-    footprint = project_gaussian(p, matmul3(R, M), constants)
-    opacity = np.float64(primitives.opacities[n]) * footprint.compensation
-    abc = conic(footprint)
-    if extent.has_full_support:
-        reach = support_box(footprint, opacity, extent.alpha_min, extent.width, extent.height)
-    else:
-        reach = inria_box(footprint, extent.width, extent.height)
-    if is_seen(p[2], opacity, footprint, abc, reach, extent.alpha_min, constants):
+    mean, quat = wide_triple(primitives.means, n), wide_quaternion(primitives.quats, n)
+    scale, opacity = wide_triple(primitives.scales, n), np.float64(primitives.opacities[n])
+    seen, depth, footprint, abc, dimmed, reach = project_one(mean, quat, scale, opacity, pose, constants, extent)
+    if seen:
         out.means2d[n, 0], out.means2d[n, 1] = footprint.x, footprint.y
-        out.depths[n] = p[2]
+        out.depths[n] = depth
         store_triple(out.conics, n, abc)
-        out.opacities[n] = opacity
+        out.opacities[n] = dimmed
         out.radii[n, 0], out.radii[n, 1] = int(reach[0]), int(reach[1])
         for i in range(4):
             out.boxes[n, i] = int(reach[2 + i])
@@ -106,10 +124,8 @@ def project(
         empty((n, 2), np.int32),
         empty((n, 4), np.int32),
     )
-    alpha_min = dtype.type(conventions.alpha_min)
-    extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
-    primitives, pose = to_device(Primitives(means, quats, scales, opacities)), to_device(pack_pose(camera))
-    launch_rows(project_rows, n, primitives, pose, pack_constants(camera, conventions), extent, out)
+    rules = pack_constants(camera, conventions), pack_extent(camera, conventions, dtype)
+    launch_rows(project_rows, n, to_device(Primitives(means, quats, scales, opacities)), pass_pose(camera), *rules, out)
     return beside(means, out)
 
 
@@ -132,6 +148,38 @@ def sum_parts(parts, n_parts, sums):
         for i in range(1, ROW_THREADS):
             total += parts[i, k]
         sums[cuda.blockIdx.x, k] = total
+
+
+@device_function
+def project_one_vjp(mean, quat, scale, opacity, pose, constants, v):
+    """Chain the gradient of one footprint.
+
+    Parameters
+    ----------
+    mean, quat, scale, opacity : tuples of float64, and float64
+    pose : Pose
+    constants : ProjectionConstants
+    v : tuple
+        Gradient with respect to centre (x, y), depth, conic (a, b, c) and opacity.
+
+    Returns
+    -------
+    gradient with respect to mean, quat, scale, opacity, camera coordinates and V, and M
+        V = R M projects the axes M of the Gaussian.
+    """
+    (v_x, v_y), v_z, v_conic, v_opacity = v
+    p = to_camera(pose.R, pose.centre, mean[0], mean[1], mean[2])
+    M = axes(quat, scale)
+    V = matmul3(pose.R, M)
+    footprint = project_gaussian(p, V, constants)
+    from_conic = conic_vjp(footprint, v_conic)
+    from_blur = compensation_vjp(footprint, v_opacity * opacity, constants)
+    v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
+    v_p, v_V = project_gaussian_vjp(p, V, constants, footprint, v_x, v_y, v_z, v_cov)
+    R_transposed = transpose3(pose.R)
+    v_quat, v_scale = axes_vjp(quat, scale, matmul3(R_transposed, v_V))
+    v_mean = dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)
+    return v_mean, v_quat, v_scale, v_opacity * footprint.compensation, v_p, v_V, M
 
 
 @gpu_kernel
@@ -157,26 +205,18 @@ def project_rows_vjp(
         out.quats[n, 3] = ZERO
         out.opacities[n] = ZERO
     elif n < n_rows:
-        R = matrix_rows(pose.R)
-        mean = wide_triple(primitives.means, n)
-        p = to_camera(R, pose.centre, mean[0], mean[1], mean[2])
-        quat, scale = wide_quaternion(primitives.quats, n), wide_triple(primitives.scales, n)
-        M = axes(quat, scale)
-        V = matmul3(R, M)
-        footprint = project_gaussian(p, V, constants)
-        v_opacity = np.float64(v.opacities[n])
-        from_conic = conic_vjp(footprint, wide_triple(v.conics, n))
-        from_blur = compensation_vjp(footprint, v_opacity * np.float64(primitives.opacities[n]), constants)
-        v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
-        v_x, v_y, v_z = np.float64(v.means2d[n, 0]), np.float64(v.means2d[n, 1]), np.float64(v.depths[n])
-        v_p, v_V = project_gaussian_vjp(p, V, constants, footprint, v_x, v_y, v_z, v_cov)
-        R_transposed = transpose3(R)
-        v_quat, v_scale = axes_vjp(quat, scale, matmul3(R_transposed, v_V))
-        store_triple(out.means, n, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
+        mean, quat = wide_triple(primitives.means, n), wide_quaternion(primitives.quats, n)
+        scale, opacity = wide_triple(primitives.scales, n), np.float64(primitives.opacities[n])
+        v_center = np.float64(v.means2d[n, 0]), np.float64(v.means2d[n, 1])
+        v_footprint = v_center, np.float64(v.depths[n]), wide_triple(v.conics, n), np.float64(v.opacities[n])
+        v_mean, v_quat, v_scale, v_opacity, v_p, v_V, M = project_one_vjp(
+            mean, quat, scale, opacity, pose, constants, v_footprint
+        )
+        store_triple(out.means, n, v_mean)
         store_triple(out.scales, n, v_scale)
         store_triple(out.quats, n, v_quat)
         out.quats[n, 3] = v_quat[3]
-        out.opacities[n] = v_opacity * footprint.compensation
+        out.opacities[n] = v_opacity
         store_pose_row(parts, thread, 0, v_p[0], v_V[0], mean, M)
         store_pose_row(parts, thread, 4, v_p[1], v_V[1], mean, M)
         store_pose_row(parts, thread, 8, v_p[2], v_V[2], mean, M)
@@ -202,7 +242,7 @@ def project_vjp(
         n,
         to_device(Primitives(means, quats, scales, opacities)),
         to_device(projection.radii),
-        to_device(pack_pose(camera)),
+        pass_pose(camera),
         pack_constants(camera, conventions),
         to_device(v_projection),
         out,

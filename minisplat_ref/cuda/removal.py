@@ -5,15 +5,23 @@ by channels; squares are summed over each warp, the warps in order into the slot
 """
 
 import functools
-from typing import Any
 
 import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.tile_state import pack_frame
-from minisplat_ref.cuda.arrays import beside, empty, to_device, zeros
+from minisplat_ref.cuda.arrays import beside, empty, to_device
 from minisplat_ref.cuda.compositing.records import COLOR, records_of
-from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, pack_lists, read_batch, thread_pixel
+from minisplat_ref.cuda.compositing.tiles import (
+    BLOCK,
+    N_WARPS,
+    batch_size,
+    clear_slots,
+    hit,
+    pack_lists,
+    read_batch,
+    thread_pixel,
+)
 from minisplat_ref.cuda.target import (
     GpuKernel,
     cuda,
@@ -33,19 +41,19 @@ from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
 def removal_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
     """Return the kernel for a dtype and a number of channels."""
     n_fields, n_colors, real = COLOR + n_channels, max(n_channels, 1), dtype.type
-    n_exchanged = BLOCK if is_simulated else 1
+    n_exchanged, n_batch = BLOCK if is_simulated else 1, batch_size(n_fields + N_WARPS, dtype)
 
     @gpu_kernel
     def remove_from_tiles(
         records,  # [N, 10 + D]
-        lists,  # Lists
+        lists,  # TileLists
         frame,
         image,  # [H, W, D]
-        slots,  # [M, 1] zeros
+        slots,  # [M, 1]
     ):
         offsets, ids, slots_of = lists
-        batch = cuda.shared.array((BATCH, n_fields), dtype)
-        partial = cuda.shared.array((BATCH, N_WARPS, 1), dtype)
+        batch = cuda.shared.array((n_batch, n_fields), dtype)
+        partial = cuda.shared.array((n_batch, N_WARPS, 1), dtype)
         exchange = cuda.shared.array((n_exchanged, 1), dtype)
         behind = cuda.local.array(n_colors, dtype)
         change = cuda.local.array(1, dtype)
@@ -56,10 +64,12 @@ def removal_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
         for k in range(n_channels):
             behind[k] = image[y, x, k] if is_pixel else real(0)
         first, end = offsets[cuda.blockIdx.x], offsets[cuda.blockIdx.x + 1]
-        for start in range(first, end, BATCH):
+        read_end = first
+        for start in range(first, end, n_batch):
             if cuda.syncthreads_count(np.int32(1) if T > ZERO else np.int32(0)) == 0:
                 break
-            n_listed = min(BATCH, end - start)
+            n_listed = min(n_batch, end - start)
+            read_end = start + n_listed
             read_batch(records, ids, start, n_listed, n_fields, batch)
             for j in range(n_listed):
                 unclamped, _, _ = hit(batch, j, center_x, center_y)
@@ -79,6 +89,7 @@ def removal_kernel(dtype: np.dtype, n_channels: int) -> GpuKernel:
                 for warp in range(N_WARPS):
                     total += partial[cuda.threadIdx.x, warp, 0]
                 slots[slots_of[start + cuda.threadIdx.x], 0] = total
+        clear_slots(slots, slots_of, read_end, end)
 
     return remove_from_tiles
 
@@ -103,14 +114,14 @@ def removal_changes(
 ) -> Floats:
     """Return the squared change of the image without each Gaussian; see ``reference.removal.removal_changes``."""
     (n, n_channels), dtype = colors.shape, colors.dtype
-    slots: Any = zeros((len(bins.gaussian_ids), 1), dtype)  # zero behind a tile's last hit
+    slots = empty((len(bins.gaussian_ids), 1), dtype)
     launch(
         removal_kernel(dtype, n_channels),
         len(bins.tile_offsets) - 1,
         BLOCK,
         records_of(projection, colors),
         pack_lists(bins),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         to_device(output.image),
         slots,
     )

@@ -1,117 +1,183 @@
 """A stable radix sort of keys with their values: of Gaussians by depth, and of their pairs by tile.
 
-A pass sorts by one digit of six bits and keeps the order of equal ones; digits come from the last to the first. A
-block has 2048 consecutive keys and each of its threads 16 of them. They count their digits in shared memory; the
-blocks' counts are scanned digit by digit; and each thread writes its keys from where those of the threads before it
-end, in their order. So there are no atomic operations, and the order is that of any stable sort.
+A pass sorts by one digit of eight bits, in one launch, and keeps the order of equal ones; digits come from the last to
+the first ("Onesweep", Adinets and Merrill 2022). How often each digit occurs is counted where the keys are made. A
+block has consecutive keys and each of its warps some rounds of 32, which its threads read side by side. Warps count
+their digits in shared memory; for each digit, the warps' counts are added up, and the blocks' by looking back
+(:mod:`minisplat_ref.cuda.scanning`); and each round is written from where the keys before it end. Atomic operations
+only count, so the order is that of any stable sort.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cuda.arrays import empty
-from minisplat_ref.cuda.scanning import exclusive_sums
-from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, is_simulated, launch, launch_rows
+from minisplat_ref.cuda.scanning import scan_block, sum_before, take_block
+from minisplat_ref.cuda.target import (
+    WARP,
+    cuda,
+    device_function,
+    gpu_kernel,
+    is_simulated,
+    launch,
+    rank_in_warp,
+    sync_warp,
+)
 
-DIGIT_BITS, THREADS = (4, 32) if is_simulated else (6, 128)  # of a block; the simulator has a Python thread for each
-N_DIGITS = 1 << DIGIT_BITS  # at most as many as threads
-KEYS = 16  # of a thread
-BLOCK_KEYS = THREADS * KEYS
+DIGIT_BITS = 8
+N_DIGITS = 1 << DIGIT_BITS
+THREADS, ROUNDS = (WARP, 2) if is_simulated else (256, 16)  # of a block; the simulator has a Python thread for each
+N_WARPS = THREADS // WARP
+N_WARP_SUMS = N_WARPS + 1  # of the warps of a block, and of all of them
+BLOCK_KEYS = THREADS * ROUNDS
+DIGITS_PER_THREAD = N_DIGITS // THREADS
+N_EXCHANGED = THREADS if is_simulated else 1
 
 
-@gpu_kernel
-def write_order(order):
-    """Write 0, 1, 2, ...: the order before a sort."""
-    i = cuda.grid(1)
-    if i < order.shape[0]:
-        order[i] = i
+class Digit(NamedTuple):
+    """A pass: its digit, and the places of its numbers in the counters."""
+
+    shift: int
+    """Bits behind the digit."""
+    length: int
+    """Place of the number of keys."""
+    totals: int
+    """First place of the number of keys with each digit."""
+    ticket: int
+    """Place of the number of blocks that have begun."""
+    states: int
+    """First place of what blocks publish: ``N_DIGITS`` numbers of each."""
+
+
+def n_key_blocks(n_keys: int) -> int:
+    """Return the number of blocks that sort so many keys."""
+    return -(-n_keys // BLOCK_KEYS)
+
+
+def plan_digits(take: Callable[[int], int], length: int, n_keys: int, n_bits: int) -> tuple[Digit, ...]:
+    """Return the passes of a sort, the first digit of all last.
+
+    Parameters
+    ----------
+    take : callable
+        Reserves so many counters and returns the place of the first.
+    length : int
+        Place of the number of keys.
+    n_keys : int
+        At most so many.
+    n_bits : int
+        Every key, unsigned, is below 2 to the power of it.
+    """
+    shifts, n_states = range(0, n_bits, DIGIT_BITS), N_DIGITS * n_key_blocks(n_keys)
+    totals = take(N_DIGITS * len(shifts))
+    return tuple(Digit(shift, length, totals + N_DIGITS * i, take(1), take(n_states)) for i, shift in enumerate(shifts))
 
 
 @device_function
-def extract_digit(keys, i, shift):
+def extract_digit(key, shift):
     """Return a digit of a key."""
-    return (keys[i] >> shift) & (N_DIGITS - 1)
+    return int((key >> shift) & (N_DIGITS - 1))
 
 
 @device_function
-def count_own(keys, shift, counts):
-    """Count the digits of the thread's keys in its column of ``counts`` [digits, threads]; return where they lie."""
-    thread = cuda.threadIdx.x
-    first = cuda.blockIdx.x * BLOCK_KEYS + thread * KEYS
-    end = min(first + KEYS, keys.shape[0])
-    for digit in range(N_DIGITS):
-        counts[digit, thread] = 0
-    for i in range(first, end):
-        counts[extract_digit(keys, i, shift), thread] += 1
+def clear_counts(counts):
+    """Set the counts of a block's digits [n, N_DIGITS] to zero; all of its threads call it."""
+    for i in range(cuda.threadIdx.x, counts.shape[0] * N_DIGITS, cuda.blockDim.x):
+        counts[i // N_DIGITS, i % N_DIGITS] = 0
     cuda.syncthreads()
-    return first, end
+
+
+@device_function
+def count_digits(key, n_digits, counts):
+    """Count the first ``n_digits`` digits of a key in ``counts`` [at least n_digits, N_DIGITS]."""
+    for i in range(n_digits):
+        cuda.atomic.add(counts, (i, extract_digit(key, DIGIT_BITS * i)), 1)
+
+
+@device_function
+def add_counts(counts, n_digits, counters, totals):
+    """Add a block's counts to the totals of all blocks; all of its threads call it."""
+    cuda.syncthreads()
+    for i in range(cuda.threadIdx.x, n_digits * N_DIGITS, cuda.blockDim.x):
+        count = counts[i // N_DIGITS, i % N_DIGITS]
+        if count > 0:
+            cuda.atomic.add(counters, totals + i, count)
 
 
 @gpu_kernel
-def count_digits(keys, shift, totals):
-    """Write how often each digit occurs in one block, to ``totals`` [digits * blocks], digit after digit."""
-    counts = cuda.shared.array((N_DIGITS, THREADS), np.int32)
-    count_own(keys, shift, counts)
-    digit = cuda.threadIdx.x
-    if digit < N_DIGITS:
-        total = np.int32(0)
-        for thread in range(THREADS):
-            total += counts[digit, thread]
-        totals[digit * cuda.gridDim.x + cuda.blockIdx.x] = total
+def sort_digit(
+    keys,  # [capacity]
+    values,  # [capacity]
+    digit,  # Digit
+    counters,
+    sorted_keys,  # [capacity]
+    sorted_values,  # [capacity]
+):
+    """Write the keys of one block and their values to their places."""
+    places = cuda.shared.array((N_WARPS, N_DIGITS), np.int32)
+    sums = cuda.shared.array(THREADS, np.int64)
+    warp_sums = cuda.shared.array(N_WARP_SUMS, np.int64)
+    exchange = cuda.shared.array(N_EXCHANGED, np.int32)
+    thread, n_keys = cuda.threadIdx.x, counters[digit.length]
+    warp, lane = thread // WARP, thread % WARP
+    block = take_block(counters, digit.ticket)
+    if block * BLOCK_KEYS >= n_keys:
+        return
+    clear_counts(places)
+    first = block * BLOCK_KEYS + warp * ROUNDS * WARP + lane
+    for turn in range(ROUNDS):
+        i = first + turn * WARP
+        if i < n_keys:
+            cuda.atomic.add(places, (warp, extract_digit(keys[i], digit.shift)), 1)
 
-
-@gpu_kernel
-def move_keys(keys, values, shift, starts, sorted_keys, sorted_values):
-    """Write the keys of one block and their values to their places, from ``starts`` [digits * blocks + 1] on."""
-    places = cuda.shared.array((N_DIGITS, THREADS), np.int32)
-    first, end = count_own(keys, shift, places)
-    digit = cuda.threadIdx.x
-    if digit < N_DIGITS:
-        place = np.int32(starts[digit * cuda.gridDim.x + cuda.blockIdx.x])
-        for thread in range(THREADS):
-            count = places[digit, thread]
-            places[digit, thread] = place
+    # The keys with smaller digits come before, then those of the blocks and of the warps before.
+    own_digits, own = thread * DIGITS_PER_THREAD, np.int64(0)
+    for d in range(own_digits, own_digits + DIGITS_PER_THREAD):
+        own += counters[digit.totals + d]
+    start = scan_block(own, sums, warp_sums)
+    for d in range(own_digits, own_digits + DIGITS_PER_THREAD):
+        total = np.int64(0)
+        for w in range(N_WARPS):
+            total += places[w, d]
+        place = start + sum_before(counters, digit.states + d, N_DIGITS, block, total)
+        for w in range(N_WARPS):
+            count = places[w, d]
+            places[w, d] = place
             place += count
+        start += counters[digit.totals + d]
     cuda.syncthreads()
-    for i in range(first, end):
-        own = extract_digit(keys, i, shift)
-        place = places[own, cuda.threadIdx.x]
-        sorted_keys[place], sorted_values[place] = keys[i], values[i]
-        places[own, cuda.threadIdx.x] = place + 1
+
+    for turn in range(ROUNDS):
+        i = first + turn * WARP
+        is_key = i < n_keys
+        own_digit = extract_digit(keys[i], digit.shift) if is_key else N_DIGITS
+        rank, n_equal = rank_in_warp(own_digit, exchange)
+        if is_key:
+            place = places[warp, own_digit] + rank
+            sorted_keys[place], sorted_values[place] = keys[i], values[i]
+        sync_warp()
+        if is_key and rank == 0:
+            places[warp, own_digit] += n_equal
+        sync_warp()
 
 
-def initial_order(n: int) -> Any:
-    """Return the numbers from 0 to ``n`` - 1, int32 on the device."""
-    order = empty(n, np.int32)
-    launch_rows(write_order, n, order)
-    return order
-
-
-def sort_by_key(keys: Any, values: Any, n_bits: int) -> tuple[Any, Any]:
+def sort_by_digits(pair: tuple[Any, Any], spare: tuple[Any, Any], digits: tuple[Digit, ...], counters: Any) -> Any:
     """Sort keys and, with them, their values; equal keys keep their order.
 
     Parameters
     ----------
-    keys : device array of shape (M,) of int32 or int64
-        Sorted as if they were unsigned. They and ``values`` are overwritten.
-    values : device array of shape (M,) of int32
-    n_bits : int
-        Every key, unsigned, is below 2 to the power of it.
+    pair, spare : tuple of device arrays of shape (capacity,)
+        Keys, int32 or int64, sorted as if they were unsigned, and values, int32. Both pairs are overwritten.
+    digits : tuple of Digit
+        From :func:`plan_digits`; the totals have been counted.
+    counters : device array of int64
 
     Returns
     -------
-    sorted keys, sorted values
-        Of the same shapes and dtypes.
+    the pair of the two that has the sorted keys and values
     """
-    n, n_blocks = len(keys), -(-len(keys) // BLOCK_KEYS)
-    if n == 0:
-        return keys, values
-    other_keys, other_values = empty(n, keys.dtype), empty(n, np.int32)
-    totals = empty(N_DIGITS * n_blocks, np.int32)
-    for shift in map(np.int32, range(0, n_bits, DIGIT_BITS)):
-        launch(count_digits, n_blocks, THREADS, keys, shift, totals)
-        starts = exclusive_sums(totals)
-        launch(move_keys, n_blocks, THREADS, keys, values, shift, starts, other_keys, other_values)
-        keys, values, other_keys, other_values = other_keys, other_values, keys, values
-    return keys, values
+    for digit in digits:
+        launch(sort_digit, n_key_blocks(len(pair[0])), THREADS, *pair, digit, counters, *spare)
+        pair, spare = spare, pair
+    return pair

@@ -32,20 +32,23 @@ __all__ = [
     "cuda",
     "describe_device",
     "device_function",
+    "float_bits",
     "free_bytes",
     "gpu_kernel",
     "is_simulated",
     "launch",
     "launch_rows",
     "n_row_blocks",
+    "rank_in_warp",
     "reduce_warps",
+    "sync_warp",
 ]
 
 MIN_CAPABILITY = (7, 5)  # the oldest that the compiler of CUDA 13 knows
 WARP = 32  # threads that run together
 FULL_WARP = 0xFFFFFFFF
-ROW_THREADS = 128  # of a block, where each thread has one Gaussian or pair
 is_simulated = bool(cuda.config.ENABLE_CUDASIM)
+ROW_THREADS = WARP if is_simulated else 128  # of a block, where each thread has one Gaussian or pair
 
 
 def check_device() -> None:
@@ -201,6 +204,29 @@ if is_simulated:
                 out[thread // WARP, k] = of_lanes[0]
         cuda.syncthreads()
 
+    @device_function
+    def rank_in_warp(value, exchange):
+        """Return how many threads of the warp before this one have an equal integer, and how many in all.
+
+        All threads of a block call it together; ``exchange`` [threads] is shared memory, which only the simulator uses.
+        """
+        thread = cuda.threadIdx.x
+        exchange[thread] = value
+        cuda.syncthreads()
+        first = thread - thread % WARP
+        is_equal = [exchange[i] == value for i in range(first, first + WARP)]
+        cuda.syncthreads()
+        return sum(is_equal[: thread - first]), sum(is_equal)
+
+    @device_function
+    def sync_warp():
+        """Wait for the other threads of the warp."""
+        cuda.syncthreads()
+
+    def float_bits(number):
+        """Return the bits of a float as an integer of the same size."""
+        return number.view(np.int32 if number.dtype == np.float32 else np.int64)
+
 else:
     from numba.cuda import libdevice
     from numba.cuda.extending import overload  # type: ignore[attr-defined]
@@ -221,6 +247,27 @@ else:
         elif thread % WARP == 0:
             for k in range(n_values):
                 out[thread // WARP, k] = values[k]
+
+    @device_function
+    def rank_in_warp(value, exchange):
+        """Return how many threads of the warp before this one have an equal integer, and how many in all."""
+        equal = np.uint32(cuda.match_any_sync(FULL_WARP, value))
+        return cuda.popc(equal & np.uint32((1 << cuda.laneid) - 1)), cuda.popc(equal)
+
+    @device_function
+    def sync_warp():
+        """Wait for the other threads of the warp."""
+        cuda.syncwarp()
+
+    def float_bits(number):
+        """Return the bits of a float as an integer of the same size."""
+        raise NotImplementedError("only kernels call it")
+
+    @overload(float_bits, target="cuda")
+    def _float_bits(number):
+        if number == float32:
+            return lambda number: libdevice.float_as_int(number)
+        return lambda number: libdevice.double_as_longlong(number)
 
     # The functions of lanes that have no version for a single number: math.floor would return an integer.
     @overload(lanes.floor, target="cuda")

@@ -45,7 +45,10 @@ class Backend:
     tile_width, tile_height : int
         Size of the tiles that the image is cut into, pixels.
     residence : module, optional
-        Further functions for a training whose arrays stay on a device; None where they are on the host.
+        Further functions for a training whose arrays stay on a device; None where they are on the host. Its passes
+        take the place of the stages from ``project`` to ``composite``.
+    is_deterministic : bool
+        Whether every run gives the same bytes.
     """
 
     name: str
@@ -66,6 +69,7 @@ class Backend:
     photometric_loss_vjp: stages.PhotometricLossVjp
     adam_update: stages.AdamUpdate
     residence: Any = None
+    is_deterministic: bool = True
 
 
 REFERENCE = Backend(
@@ -149,6 +153,7 @@ def load_cuda() -> Backend:
         adam,
         compositing,
         depth,
+        footprints,
         loss,
         projection,
         removal,
@@ -162,8 +167,8 @@ def load_cuda() -> Backend:
     return replace(
         CPU,
         name="cuda",
-        tile_width=tiling.TILE,
-        tile_height=tiling.TILE,
+        tile_width=footprints.TILE,
+        tile_height=footprints.TILE,
         project=projection.project,
         project_vjp=projection.project_vjp,
         sh_colors=spherical_harmonics.sh_colors,
@@ -186,7 +191,8 @@ def load_cuda_atomic() -> Backend:
     """Return the same with atomic additions in the gradient of blending: faster, but every run rounds differently."""
     from minisplat_ref.cuda import compositing
 
-    return replace(load_cuda(), name=CUDA_ATOMIC, composite_vjp=compositing.composite_vjp_atomic)
+    atomic = compositing.composite_vjp_atomic
+    return replace(load_cuda(), name=CUDA_ATOMIC, composite_vjp=atomic, is_deterministic=False)
 
 
 def get_backend(name: str) -> Backend:

@@ -27,7 +27,6 @@ from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, RenderGradient, Request
 from minisplat_ref.rendering.backends import Backend
-from minisplat_ref.rendering.splatting import splat
 from minisplat_ref.training import iteration
 from minisplat_ref.training.adam import AdamState, adam_step
 from minisplat_ref.training.case import Case
@@ -37,7 +36,7 @@ from minisplat_ref.training.losses import Loss, LossTerm, photometric
 from minisplat_ref.training.rates import n_coefficients
 from minisplat_ref.training.schedule import BLEND_STATS, DatedEvent, Recipe
 from minisplat_ref.training.state import DEGREES, StepReport, TrainState
-from minisplat_ref.types import NOTHING, Floats, Gaussians, Ints, ProjectionGradient, RenderOutput, View
+from minisplat_ref.types import NOTHING, Floats, Gaussians, Ints, RenderOutput, View
 
 PHOTOGRAPHS_SHARE = 0.25  # of the free memory of the device, for photographs that stay there
 
@@ -73,6 +72,7 @@ class OnDevice:
         self.backend, self.device = backend, backend.residence
         self.gaussians: Any = None
         self.adam: Any = None
+        self._passes: Any = None
         self.is_newer = False
         """Whether these are newer than those of the state."""
         self._photographs: dict[tuple[str, tuple[int, ...]], Any] = {}
@@ -116,31 +116,27 @@ class OnDevice:
         """Render a view, compare it with its photograph, and chain the gradient to the parameters."""
         view, request, (term,) = case.view, case.request, case.terms
         self._take(state, view)
-        g, backend, camera, conventions = self.gaussians, self.backend, view.camera, request.conventions
-        degree, dtype = _degree(request, g.sh_rest), g.means.dtype
-        primitives = self.device.activate(g, request.is_visible)
+        g = self.gaussians
         assert request.background is not None
-        splats = splat(
-            primitives,
-            lambda radii: backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, radii),
-            camera,
-            request.background.astype(dtype),
-            conventions,
-            backend,
-            with_stats=bool(request.wants),
+        options = self.device.Options(
+            request.background.astype(g.means.dtype),
+            _degree(request, g.sh_rest),
+            request.conventions,
+            request.is_visible,
+            bool(request.wants),
         )
         dssim_weight = term.function.keywords["dssim_weight"]  # type: ignore[attr-defined]
-        target, mask = self._photograph(view)
-        loss, tape = backend.photometric_loss(splats.output.image, target, dssim_weight, mask)
-        v_image, projection = backend.photometric_loss_vjp(tape), splats.projection
-        blended = projection, splats.channels, splats.background, splats.bins, conventions, splats.output
-        v = backend.composite_vjp(*blended, v_image, self._zeros(splats.output.alpha))
-        v_projection = ProjectionGradient(v.means2d, self._depth_zeros(len(g.means), dtype), v.conics, v.opacities)
-        v_primitives = backend.project_vjp(*primitives, camera, conventions, projection, v_projection)
-        v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, degree, projection.radii, v.colors)
-        gradient = self.device.chain(g, primitives, v_primitives, v_sh)
-        output = splats.output._replace(n_pairs=len(splats.bins.gaussian_ids))
-        return Differentiated(output, loss, gradient, v_image, v.means2d, projection.radii)
+        photograph, passes = self._photograph(view), self._passes
+        while True:
+            tape = passes.render(g, view.camera, options)
+            compared = passes.compare(tape.output.image, photograph, dssim_weight)
+            v = passes.render_vjp(tape, compared.v_image, self._zeros(tape.output.alpha))
+            # The first number that is read waits for all of this. Where there was no room for all pairs, now there is.
+            if (n_pairs := passes.count_pairs(tape)) <= tape.capacity:
+                break
+        loss, output = self.device.read_loss(compared, photograph.n_values, dssim_weight), tape.output
+        output = output._replace(n_pairs=n_pairs)
+        return Differentiated(output, loss, v.gaussians, compared.v_image, v.means2d, tape.footprints.radii)
 
     def check_step(self, state: TrainState, case: Case, found: Differentiated, guard: Guard) -> Wrong | None:
         """Check the loss, and the arrays when they are due; as :meth:`~minisplat_ref.training.guard.Guard.check_step`.
@@ -165,9 +161,9 @@ class OnDevice:
         limits = 3 * n_coefficients(state.stats[DEGREES]).astype(np.int32) if DEGREES in state.stats else None
         widths = {}
         if rule.is_visible_only:
-            widths = dict.fromkeys(self.gaussians._fields, self.device.visible_widths(found.radii, None))
+            widths = dict.fromkeys(self.gaussians._fields, self._passes.visible_widths(found.radii, None))
             if limits is not None:
-                widths["sh_rest"] = self.device.visible_widths(found.radii, limits)
+                widths["sh_rest"] = self._passes.visible_widths(found.radii, limits)
         elif limits is not None:
             widths = {"sh_rest": self.device.to_device(limits)}
         dense: Any = rule._replace(is_visible_only=False)  # the widths select the rows
@@ -190,20 +186,21 @@ class OnDevice:
                 f" {needs / 1e9:.2f} GB are needed, {free / 1e9:.2f} GB are free; train on smaller photographs"
                 " (--downscale), by a recipe that keeps to a --budget, or with --backend cpu"
             )
+        self._passes = self._passes or self.device.Passes(self.backend.is_deterministic)
         adam, to_device = state.adam, self.device.to_device
         self.gaussians = to_device(g)
         self.adam = AdamState(to_device(adam.first), to_device(adam.second), adam.step, adam.joined)
 
-    def _photograph(self, view: View) -> tuple[Any, Any]:
+    def _photograph(self, view: View) -> Any:
         """Return a photograph and its mask on the device; they stay there while there is room."""
         key = view.name, view.image.shape
         if key not in self._photographs:
-            both = self.device.to_device(view.image), self.device.to_device(view.mask)
+            photograph = self.device.prepare_photograph(view.image, view.mask)
             n_bytes = view.image.nbytes + (0 if view.mask is None else view.mask.nbytes)
             if n_bytes > self._room:
-                return both
+                return photograph
             self._room -= n_bytes
-            self._photographs[key] = both
+            self._photographs[key] = photograph
         return self._photographs[key]
 
     def _note_once(self, why: str) -> list[str]:
@@ -219,9 +216,6 @@ class OnDevice:
         if self._nothing is None or (self._nothing.shape, self._nothing.dtype) != (like.shape, like.dtype):
             self._nothing = self.device.zeros(like.shape, like.dtype)
         return self._nothing
-
-    def _depth_zeros(self, n: int, dtype: Any) -> Any:
-        return self.device.zeros((n, 1), dtype).reshape(n)
 
 
 def find_obstacle(state: TrainState, recipe: Recipe, step: int) -> str | None:

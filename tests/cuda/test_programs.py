@@ -22,7 +22,9 @@ REGISTERS = {
     "similarity_tiles": 88,
     "similarity_tiles_vjp": 88,
     "update_numbers": 40,
+    "sort_digit": 40,
 }
+WIDE_REGISTERS = {"prepare_rows": 80, "chain_rows": 160}  # of kernels with float64, as projection has
 
 
 def has_assembler():
@@ -61,11 +63,17 @@ def test_every_kernel_compiles_and_spills_nothing(programs):
         assert program["spills"] == program["stack"] == 0, program
 
 
+def test_the_kernels_of_both_passes_have_few_registers(programs):
+    found = [program for program in programs if program["kernel"] in WIDE_REGISTERS]
+    assert len(found) == len(WIDE_REGISTERS) + 1  # the gradient with and without atomics
+    for program in found:
+        assert program["registers"] <= WIDE_REGISTERS[program["kernel"]] and program["doubles"] > 0, program
+
+
 def test_blending_has_no_float64_and_few_registers(programs):
     tile_programs = [program for program in programs if program["kernel"] in REGISTERS]
-    assert (
-        len(tile_programs) == len(REGISTERS) + 2
-    )  # forward with and without statistics, backward with and without atomics
+    # Forward with and without statistics, backward with and without atomics; keys of tiles and of depths are alike.
+    assert len(tile_programs) == len(REGISTERS) + 2
     for program in tile_programs:
         assert program["doubles"] == 0, program
         assert program["registers"] <= REGISTERS[program["kernel"]], program

@@ -28,14 +28,14 @@ from minisplat_ref.cuda import (
     projection,
     removal,
     resident,
-    sorting,
     spherical_harmonics,
     target,
     tiling,
 )
+from minisplat_ref.cuda.footprints import TILE
 from minisplat_ref.cuda.target import GpuKernel, cuda
 from minisplat_ref.rendering.backends import REFERENCE
-from minisplat_ref.types import AdamStep, PrimitiveGradient, ProjectionGradient, SHGradient, TileGrid
+from minisplat_ref.types import AdamStep, ProjectionGradient, TileGrid
 from scenes import activated, as_dtype, make_camera, make_gaussians
 
 
@@ -75,10 +75,8 @@ def record_launches():
             projection.project(*primitives, camera, conventions)
         p = REFERENCE.project(*primitives, camera, GSPLAT_MAIN)
         p = p._replace(conics=p.conics.astype(np.float64))
-        grid = TileGrid(camera.width, camera.height, tiling.TILE, tiling.TILE)
+        grid = TileGrid(camera.width, camera.height, TILE, TILE)
         tiling.bin_gaussians(p, grid, GSPLAT_MAIN)
-        pairs = np.zeros(5_000_000, np.int32)  # whose counts are scanned by several blocks
-        sorting.sort_by_key(pairs, pairs.copy(), 4)
         bins = REFERENCE.bin_gaussians(p, grid, GSPLAT_MAIN)
         harmonics = g.means, g.sh_dc, g.sh_rest, camera, 3, p.radii
         colors = spherical_harmonics.sh_colors(*harmonics)
@@ -94,12 +92,11 @@ def record_launches():
         ids, normals = output.stats.dominant_ids, np.zeros_like(output.image)
         depth.surface_points_vjp(*primitives[:3], camera, ids, normals, output.alpha)
         loss.photometric_loss(output.image, np.zeros(output.image.shape, np.uint8), 0.2)
-        activated_there = resident.activate(g, None)
-        v_primitives = PrimitiveGradient(*primitives, np.eye(3), np.zeros(3))
-        resident.chain(
-            g, activated_there, v_primitives, SHGradient(g.means, g.sh_dc, g.sh_rest, np.eye(3), np.zeros(3))
-        )
-        resident.visible_widths(p.radii, None)
+        for is_deterministic in (False, True):
+            passes = resident.Passes(is_deterministic)
+            tape = passes.render(g, camera, resident.Options(background, 3, GSPLAT_MAIN, with_stats=True))
+            passes.render_vjp(tape, tape.output.image, tape.output.alpha)
+        passes.visible_widths(p.radii, None)
         resident.has_wrong(g)
         adam.adam_update(g.means, g.means, g.means, g.means, None, AdamStep(0.01, 0.9, 0.999, 1e-15))
     return launches

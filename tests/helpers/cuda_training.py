@@ -90,16 +90,20 @@ def numbers_of(state):
 
 
 def count_copies(scene, backend):
-    """Shapes copied to the device and back in each of two iterations in which nobody looks at the parameters."""
+    """Shapes copied to the device and back, and allocated, in three iterations; nobody looks at the parameters."""
     from minisplat_ref.cuda import arrays
 
-    copied, steps = {"to": [], "from": []}, []
-    to_device, fake = arrays.cuda.to_device, type(arrays.empty(1, np.float32))
+    copied, steps = {"to": [], "from": [], "new": []}, []
+    to_device, device_array, fake = arrays.cuda.to_device, arrays.cuda.device_array, type(arrays.empty(1, np.float32))
     to_host = fake.copy_to_host
 
     def counted_to_device(x, *args, **named):
         copied["to"].append(x.shape)
         return to_device(x, *args, **named)
+
+    def counted_array(shape, dtype):
+        copied["new"].append(shape)
+        return device_array(shape, dtype)
 
     def counted_to_host(self, *args, **named):
         copied["from"].append(self.shape)
@@ -107,17 +111,18 @@ def count_copies(scene, backend):
 
     def on_step(report):
         steps.append(dict(copied))
-        copied.update({"to": [], "from": []})
+        copied.update({"to": [], "from": [], "new": []})
 
     def no_array(self, *args, **named):
         raise AssertionError("an array was copied behind the counter's back")
 
     with (
         patch.object(arrays.cuda, "to_device", counted_to_device),
+        patch.object(arrays.cuda, "device_array", counted_array),
         patch.object(fake, "copy_to_host", counted_to_host),
         patch.object(fake, "__array__", no_array, create=True),
     ):
-        train(scene, recipe_of("3dgs-accel", 2), seed=0, backend=backend, on_step=on_step, guard=Guard(every=2))
+        train(scene, recipe_of("3dgs-accel", 3), seed=0, backend=backend, on_step=on_step, guard=Guard(every=2))
     return steps
 
 

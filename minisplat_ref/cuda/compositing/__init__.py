@@ -1,6 +1,6 @@
 """Front-to-back blending of all tiles, forward and backward: the functions around the kernels."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,10 +10,73 @@ from minisplat_ref.cuda.arrays import beside, empty, to_device, to_host, zeros
 from minisplat_ref.cuda.compositing.backward import backward_kernel
 from minisplat_ref.cuda.compositing.forward import forward_kernel
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS, N_PAIR_STATS, sum_pair_stats, sum_slots
-from minisplat_ref.cuda.compositing.records import records_of
-from minisplat_ref.cuda.compositing.tiles import BLOCK, Pixels, pack_lists
+from minisplat_ref.cuda.compositing.records import COLOR, records_of
+from minisplat_ref.cuda.compositing.tiles import BLOCK, Pixels, pack_lists, pass_background
 from minisplat_ref.cuda.target import launch, launch_rows
-from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
+from minisplat_ref.cuda.tiling import TileLists
+from minisplat_ref.cuda.workspace import Workspace
+from minisplat_ref.scalar.compositing import Frame
+from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Ints, Projection, RenderOutput, TileBins
+
+
+class Blended(NamedTuple):
+    """A blended image, and what was collected; all arrays are on the device."""
+
+    pixels: Pixels
+    slots: Floats
+    """[M, 3] statistics of each pair, or [0, 3]."""
+    median_depth: Floats
+    """[H, W], or [0, 0] where nothing was collected; likewise below."""
+    dominant_ids: Ints
+    """[H, W]."""
+
+
+def blend(
+    workspace: Workspace,
+    records: Any,
+    depths: Any,
+    background: tuple[Any, ...],
+    lists: TileLists,
+    frame: Frame,
+    collects: bool,
+) -> Blended:
+    """Blend every tile's Gaussians, with statistics or without, into arrays of a workspace.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    records : device array of shape (N, 10 + D)
+    depths : device array of shape (N,)
+    background : tuple of D numbers
+    lists : TileLists
+    frame : Frame
+    collects : bool
+        Whether statistics are collected.
+    """
+    dtype, n_channels = records.dtype, records.shape[1] - COLOR
+    shape, n_tiles = (frame.height, frame.width), len(lists.offsets) - 1
+    stats_shape, n_slots = (shape, len(lists.ids)) if collects else ((0, 0), 0)
+    blended = Blended(
+        Pixels(workspace.array("image", (*shape, n_channels), dtype), workspace.array("alpha", shape, dtype)),
+        workspace.array("pair_stats", (n_slots, N_PAIR_STATS), dtype),
+        workspace.array("median_depth", stats_shape, dtype),
+        workspace.array("dominant_ids", stats_shape, np.int32),
+    )
+    kernel = forward_kernel(dtype, n_channels, collects)
+    launch(kernel, n_tiles, BLOCK, records, depths, background, lists, frame, *blended[:1], blended[1:])
+    return blended
+
+
+def collect_stats(workspace: Workspace, blended: Blended, offsets: Any) -> BlendStats:
+    """Return the statistics of every Gaussian on the host; ``offsets`` [N + 1] are those of its slots."""
+    n, dtype = len(offsets) - 1, blended.slots.dtype
+    sums = workspace.array("weight_sums", (n,), dtype), workspace.array("weight_maxima", (n,), dtype)
+    hits = workspace.array("hit_counts", (n,), np.int32)
+    launch_rows(sum_pair_stats, n, blended.slots, offsets, *sums, hits)
+    ids = to_host(blended.dominant_ids)
+    dominant_count = np.bincount(ids[ids >= 0], minlength=n).astype(np.int32)
+    weight_sum, weight_max, hit_count = map(to_host, (*sums, hits))
+    return BlendStats(weight_sum, weight_max, hit_count, dominant_count, ids)
 
 
 def composite(
@@ -30,34 +93,18 @@ def composite(
 
     Statistics are on the host wherever the data are: only density control and pruning read them.
     """
-    grid, (n, n_channels), dtype = bins.grid, colors.shape, colors.dtype
-    shape, collects = (grid.height, grid.width), with_stats or with_median_depth
-    pixels = Pixels(empty((*shape, n_channels), dtype), empty(shape, dtype))
-    stats_shape = shape if collects else (1, 1)
-    slots = zeros((len(bins.gaussian_ids) if collects else 1, N_PAIR_STATS), dtype)  # zero behind a tile's last hit
-    median_depth, dominant_ids = empty(stats_shape, dtype), empty(stats_shape, np.int32)
-    launch(
-        forward_kernel(dtype, n_channels, collects),
-        grid.n_tiles_x * grid.n_tiles_y,
-        BLOCK,
+    blended = blend(
+        workspace := Workspace(),
         records_of(projection, colors),
         to_device(projection.depths),
-        to_device(background),
+        pass_background(background),
         pack_lists(bins),
-        pack_frame(bins, conventions, dtype),
-        pixels,
-        (slots, median_depth, dominant_ids),
+        pack_frame(bins.grid, conventions, colors.dtype),
+        with_stats or with_median_depth,
     )
-    stats = None
-    if with_stats:
-        ids = to_host(dominant_ids)
-        sums = empty(n, dtype), empty(n, dtype), empty(n, np.int32)
-        launch_rows(sum_pair_stats, n, slots, to_device(bins.gaussian_offsets), *sums)
-        dominant_count = np.bincount(ids[ids >= 0], minlength=n).astype(np.int32)
-        weight_sum, weight_max, hit_count = map(to_host, sums)
-        stats = BlendStats(weight_sum, weight_max, hit_count, dominant_count, ids)
-    image, alpha = beside(colors, pixels)
-    return RenderOutput(image, alpha, beside(colors, median_depth) if with_median_depth else None, stats)
+    stats = collect_stats(workspace, blended, to_device(bins.gaussian_offsets)) if with_stats else None
+    image, alpha = beside(colors, blended.pixels)
+    return RenderOutput(image, alpha, beside(colors, blended.median_depth) if with_median_depth else None, stats)
 
 
 def composite_vjp(
@@ -98,8 +145,8 @@ def _vjp(
 ) -> CompositeGradient:
     projection, colors, _ = inputs
     (n, n_channels), dtype = colors.shape, colors.dtype
-    n_slots = n if is_atomic else len(bins.gaussian_ids)
-    slots = zeros((n_slots, N_MOMENTS + n_channels), dtype)  # zero behind a tile's last hit
+    n_sums = N_MOMENTS + n_channels
+    slots = zeros((n, n_sums), dtype) if is_atomic else empty((len(bins.gaussian_ids), n_sums), dtype)
     n_tiles = len(bins.tile_offsets) - 1
     v_backgrounds = empty((n_tiles, n_channels), dtype)
     launch(
@@ -108,7 +155,7 @@ def _vjp(
         BLOCK,
         records_of(projection, colors),
         pack_lists(bins),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         to_device(Pixels(output.image, output.alpha)),
         to_device(Pixels(_as_dtype(v.image, dtype), _as_dtype(v.alpha, dtype))),
         slots,

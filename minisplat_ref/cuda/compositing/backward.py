@@ -15,7 +15,15 @@ import numpy as np
 
 from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS
 from minisplat_ref.cuda.compositing.records import COLOR
-from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, read_batch, thread_pixel
+from minisplat_ref.cuda.compositing.tiles import (
+    BLOCK,
+    N_WARPS,
+    batch_size,
+    clear_slots,
+    hit,
+    read_batch,
+    thread_pixel,
+)
 from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, reduce_warps
 from minisplat_ref.jit.lanes import select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -26,23 +34,23 @@ from minisplat_ref.scalar.compositing import blend, sigma_vjp
 def backward_kernel(dtype: np.dtype, n_channels: int, is_atomic: bool = False) -> GpuKernel:
     """Return the backward kernel for a dtype and a number of channels, deterministic or atomic."""
     n_fields, n_colors, n_sums, real = COLOR + n_channels, max(n_channels, 1), N_MOMENTS + n_channels, dtype.type
-    n_exchanged = BLOCK if is_simulated else 1
+    n_exchanged, n_batch = BLOCK if is_simulated else 1, batch_size(n_fields + N_WARPS * n_sums, dtype)
 
     @gpu_kernel
     def composite_tiles_vjp(
         records,  # [N, 10 + D]
-        lists,  # Lists
+        lists,  # TileLists
         frame,
         pixels,  # Pixels
         v_pixels,  # Pixels
-        slots,  # [M, 6 + D] zeros; if atomic [N, 6 + D], sums of each Gaussian
+        slots,  # [M, 6 + D] of pairs; if atomic [N, 6 + D] zeros, sums of each Gaussian
         v_backgrounds,  # [n_tiles, D]
     ):
         offsets, ids, slots_of = lists
         image, alpha = pixels
         v_image, v_alpha = v_pixels
-        batch = cuda.shared.array((BATCH, n_fields), dtype)
-        partial = cuda.shared.array((BATCH, N_WARPS, n_sums), dtype)
+        batch = cuda.shared.array((n_batch, n_fields), dtype)
+        partial = cuda.shared.array((n_batch, N_WARPS, n_sums), dtype)
         exchange = cuda.shared.array((n_exchanged, n_sums), dtype)
         v = cuda.local.array(n_colors, dtype)
         summed = cuda.local.array(n_sums, dtype)
@@ -59,10 +67,12 @@ def backward_kernel(dtype: np.dtype, n_channels: int, is_atomic: bool = False) -
                 v[k] = v_image[y, x, k]
                 behind += v[k] * image[y, x, k]
         first, end = offsets[cuda.blockIdx.x], offsets[cuda.blockIdx.x + 1]
-        for start in range(first, end, BATCH):
+        read_end = first
+        for start in range(first, end, n_batch):
             if cuda.syncthreads_count(np.int32(1) if T > ZERO else np.int32(0)) == 0:
                 break
-            n_listed = min(BATCH, end - start)
+            n_listed = min(n_batch, end - start)
+            read_end = start + n_listed
             read_batch(records, ids, start, n_listed, n_fields, batch)
             for j in range(n_listed):
                 unclamped, e, dy = hit(batch, j, center_x, center_y)
@@ -90,6 +100,8 @@ def backward_kernel(dtype: np.dtype, n_channels: int, is_atomic: bool = False) -
                     cuda.atomic.add(slots, (ids[start + j], k), total)
                 else:
                     slots[slots_of[start + j], k] = total
+        if not is_atomic:
+            clear_slots(slots, slots_of, read_end, end)
         cuda.syncthreads()
         for k in range(n_channels):
             summed[k] = abs(T) * v[k]

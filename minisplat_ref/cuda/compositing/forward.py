@@ -14,7 +14,15 @@ import numpy as np
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cuda.compositing.pair_sums import HIT_COUNT, N_PAIR_STATS, N_PAIR_SUMS, WEIGHT_MAX, WEIGHT_SUM
 from minisplat_ref.cuda.compositing.records import COLOR
-from minisplat_ref.cuda.compositing.tiles import BATCH, BLOCK, N_WARPS, hit, read_batch, thread_pixel
+from minisplat_ref.cuda.compositing.tiles import (
+    BLOCK,
+    N_WARPS,
+    batch_size,
+    clear_slots,
+    hit,
+    read_batch,
+    thread_pixel,
+)
 from minisplat_ref.cuda.target import GpuKernel, cuda, gpu_kernel, is_simulated, reduce_warps
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -28,22 +36,23 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
     """Return the forward kernel for a dtype, a number of channels, with or without statistics."""
     n_fields, n_colors, real = COLOR + n_channels, max(n_channels, 1), dtype.type
     n_exchanged = BLOCK if has_stats and is_simulated else 1
-    n_partial = BATCH if has_stats else 1
+    n_batch = batch_size(n_fields + (N_WARPS * N_PAIR_STATS if has_stats else 0), dtype)
+    n_partial = n_batch if has_stats else 1
 
     @gpu_kernel
     def composite_tiles(
         records,  # [N, 10 + D]
         depths,  # [N]
-        background,  # [D]
-        lists,  # Lists
+        background,  # D numbers
+        lists,  # TileLists
         frame,
         pixels,  # Pixels
-        stats,  # slots [M, 3], median depth [H, W], dominant ids [H, W]
+        stats,  # slots [M, 3] of pairs, median depth [H, W], dominant ids [H, W]
     ):
         offsets, ids, slots_of = lists
         image, alpha = pixels
         slots, median_depth, dominant_ids = stats
-        batch = cuda.shared.array((BATCH, n_fields), dtype)
+        batch = cuda.shared.array((n_batch, n_fields), dtype)
         partial = cuda.shared.array((n_partial, N_WARPS, N_PAIR_STATS), dtype)
         exchange = cuda.shared.array((n_exchanged, N_PAIR_STATS), dtype)
         color = cuda.local.array(n_colors, dtype)
@@ -56,10 +65,12 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
             color[k] = ZERO
         best, crossing, best_id = real(0), real(0), np.int32(-1)
         first, end = offsets[cuda.blockIdx.x], offsets[cuda.blockIdx.x + 1]
-        for start in range(first, end, BATCH):
+        read_end = first
+        for start in range(first, end, n_batch):
             if cuda.syncthreads_count(np.int32(1) if T > ZERO else np.int32(0)) == 0:
                 break
-            n_listed = min(BATCH, end - start)
+            n_listed = min(n_batch, end - start)
+            read_end = start + n_listed
             read_batch(records, ids, start, n_listed, n_fields, batch)
             for j in range(n_listed):
                 unclamped, _, _ = hit(batch, j, center_x, center_y)
@@ -90,6 +101,8 @@ def forward_kernel(dtype: np.dtype, n_channels: int, has_stats: bool) -> GpuKern
                         hits += partial[j, warp, HIT_COUNT]
                         largest = maximum(largest, partial[j, warp, WEIGHT_MAX])
                     slots[slot, WEIGHT_SUM], slots[slot, HIT_COUNT], slots[slot, WEIGHT_MAX] = total, hits, largest
+        if has_stats:
+            clear_slots(slots, slots_of, read_end, end)
         if is_pixel:
             left = abs(T)
             alpha[y, x] = ONE - left

@@ -6,12 +6,25 @@ Conics are float64; their factors are computed here, once for each Gaussian, so 
 from typing import Any
 
 from minisplat_ref.cuda.arrays import empty, to_device
-from minisplat_ref.cuda.target import cuda, gpu_kernel, launch_rows
+from minisplat_ref.cuda.target import cuda, device_function, gpu_kernel, launch_rows
 from minisplat_ref.scalar.compositing import factors, halve_factor
 from minisplat_ref.types import Floats, Projection
 
 # Columns. The conic is stored as its factors, two of them halved as sigma needs them; edges of the box are floats.
 MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY, X0, Y0, X1, Y1, COLOR = range(11)
+
+
+@device_function
+def store_record(records, n, center, conic, opacity, box, color):
+    """Write the record of a Gaussian; colours from ``color[0]`` on are of its channels."""
+    a, slope, pivot = factors(conic[0], conic[1], conic[2])
+    records[n, MEAN_X], records[n, MEAN_Y] = center[0], center[1]
+    records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT] = halve_factor(a), slope, halve_factor(pivot)
+    records[n, OPACITY] = opacity
+    for i in range(4):
+        records[n, X0 + i] = box[i]
+    for k in range(records.shape[1] - COLOR):
+        records[n, COLOR + k] = color[k]
 
 
 @gpu_kernel
@@ -20,14 +33,8 @@ def write_records(projection, colors, records):
     n = cuda.grid(1)
     if n >= records.shape[0] or projection.radii[n, 0] == 0:
         return
-    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
-    records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], projection.means2d[n, 1]
-    records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT] = halve_factor(a), slope, halve_factor(pivot)
-    records[n, OPACITY] = projection.opacities[n]
-    for i in range(4):
-        records[n, X0 + i] = projection.boxes[n, i]
-    for k in range(colors.shape[1]):
-        records[n, COLOR + k] = colors[n, k]
+    center, conic = projection.means2d[n], projection.conics[n]
+    store_record(records, n, center, conic, projection.opacities[n], projection.boxes[n], colors[n])
 
 
 def records_of(projection: Projection, colors: Floats) -> Any:

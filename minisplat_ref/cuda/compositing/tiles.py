@@ -2,34 +2,52 @@
 
 from typing import Any, NamedTuple
 
-from minisplat_ref.cuda.arrays import to_device
+import numpy as np
+
+from minisplat_ref.cuda.arrays import to_device, to_host
 from minisplat_ref.cuda.compositing.records import HALF_A, HALF_PIVOT, MEAN_X, MEAN_Y, OPACITY, SLOPE, X0, X1, Y0, Y1
-from minisplat_ref.cuda.target import WARP, cuda, device_function
-from minisplat_ref.cuda.tiling import TILE
+from minisplat_ref.cuda.footprints import TILE
+from minisplat_ref.cuda.target import WARP, cuda, device_function, is_simulated
+from minisplat_ref.cuda.tiling import TileLists
 from minisplat_ref.jit.lanes import libm_exp, select
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import mahalanobis
-from minisplat_ref.types import Floats, Ints, TileBins
+from minisplat_ref.types import Floats, TileBins
 
 BLOCK = TILE * TILE
 N_WARPS = BLOCK // WARP
-BATCH = 32  # Gaussians in shared memory
+SHARED_BYTES = 24 << 10  # of a block, so that several blocks have room on a multiprocessor
 
 
-class Lists(NamedTuple):
-    """The tiles' lists as kernels read them; see :class:`~minisplat_ref.types.TileBins`."""
+def batch_size(n_numbers: int, dtype: np.dtype) -> int:
+    """Return how many Gaussians are read at once into shared memory.
 
-    offsets: Ints
-    """[n_tiles + 1] tile t owns the pairs [offsets[t], offsets[t + 1])."""
-    ids: Ints
-    """[M] Gaussian of each pair."""
-    slots: Ints
-    """[M] slot of each pair."""
+    Parameters
+    ----------
+    n_numbers : int
+        In shared memory for each of them.
+    dtype : dtype
+        Of these numbers.
+
+    Returns
+    -------
+    int
+        From one warp to one block of them.
+    """
+    n, most = WARP, WARP if is_simulated else BLOCK  # in the simulator few, so that tests have several batches
+    while n < most and 2 * n * n_numbers * dtype.itemsize <= SHARED_BYTES:
+        n *= 2
+    return n
 
 
 def pack_lists(bins: TileBins) -> Any:
     """Return the lists on the device."""
-    return to_device(Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots))
+    return to_device(TileLists(bins.tile_offsets, bins.gaussian_ids, bins.slots))
+
+
+def pass_background(background: Floats) -> tuple[Any, ...]:
+    """Return the background as numbers, which are passed to a kernel without a copy to the device; at least one."""
+    return tuple(to_host(background)) or (background.dtype.type(0),)
 
 
 class Pixels(NamedTuple):
@@ -51,12 +69,20 @@ def thread_pixel(frame):
 
 @device_function
 def read_batch(records, ids, first, n_listed, n_fields, batch):
-    """Read up to ``BATCH`` records of the pairs from ``first`` on; all threads of the block call it."""
+    """Read the records of ``n_listed`` pairs from ``first`` on; all threads of the block call it."""
     cuda.syncthreads()  # all have finished with the batch before
     for i in range(cuda.threadIdx.x, n_listed * n_fields, BLOCK):
         j = i // n_fields
         batch[j, i - j * n_fields] = records[ids[first + j], i - j * n_fields]
     cuda.syncthreads()
+
+
+@device_function
+def clear_slots(slots, slots_of, first, end):
+    """Set the slots of some pairs to zero: those behind a tile's last batch. All threads of the block call it."""
+    n_numbers = slots.shape[1]
+    for i in range(first * n_numbers + cuda.threadIdx.x, end * n_numbers, BLOCK):
+        slots[slots_of[i // n_numbers], i % n_numbers] = ZERO
 
 
 @device_function
