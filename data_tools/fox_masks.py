@@ -4,7 +4,7 @@
     minisplat-ref train fox --downscale 2 --out runs/fox
     minisplat-ref segment label runs/fox --masks masks --extract 1 --out head.ply
 
-Five of fifty photographs are enough to take the head out; it is what docs/FAMILY.md describes.
+Five of fifty photographs are enough to take the head out; it is what docs/family/segment.md describes.
 """
 
 import argparse

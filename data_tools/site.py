@@ -1,7 +1,7 @@
 """Hooks of MkDocs: pages that are made while the site is built, and links that lead out of ``docs/``.
 
-The README, CONTRIBUTING and the changelog are pages of the site, too. On a code host, a link to a file that is no page
-leads to that file; on the site it becomes the path of the file, or leads to the API page of its module.
+The README, CONTRIBUTING, the changelog and the notebooks are pages of the site, too. On a code host, a link to a file
+that is no page leads to that file; on the site it becomes the path of the file, or leads to the API page of its module.
 """
 
 import os
@@ -10,13 +10,21 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data_tools.site_notebooks import FOLDER, convert_notebook, formulas_in_mathml
+
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
-FROM_ROOT = {"index.md": "README.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
+FROM_ROOT = {
+    "index.md": "README.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+    f"{FOLDER}/index.md": f"{FOLDER}/README.md",
+}
+NOTEBOOKS = {f"{FOLDER}/{path.stem}.md": path for path in sorted((ROOT / FOLDER).glob("[0-9]*.ipynb"))}
 API = {
     "types": ("Types and constants", ("minisplat_ref.types", "minisplat_ref.constants", "minisplat_ref.errors")),
     "rendering": (
@@ -39,7 +47,29 @@ API = {
 }
 """Pages of the API reference: title, and the packages whose docstrings stand there."""
 
+FENCES = ("```", "~~~")
+ITEM = re.compile(r"(?:[-*+]|\d+[.)]) +(?=\S)")
+CELL = re.compile(r"<td\b.*?</td>", re.DOTALL)
+LONG_NAME = re.compile(r"(?<=<code>)[^<\s]{16,}(?=</code>)")
+COMMIT = re.compile(r"/([\w.-]+)@(?=[0-9a-f]{7}\b)(?![^<>]*>)")  # and not in a link's address
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def on_config(config: "MkDocsConfig") -> "MkDocsConfig":
+    """List the pages that ``nav`` names by a pattern: those of the family in the order of its table, all notebooks."""
+    family = re.findall(r"\]\((family/[\w-]+\.md)\)", (ROOT / "docs" / "FAMILY.md").read_text(encoding="utf-8"))
+    config.nav = _expand(config.nav or [], {"family/*.md": family, f"{FOLDER}/*.md": list(NOTEBOOKS)})
+    return config
+
+
+def _expand(entries: list[Any], pages: dict[str, list[str]]) -> list[Any]:
+    expanded: list[Any] = []
+    for entry in entries:
+        if isinstance(entry, str):
+            expanded += pages.get(entry, [entry])
+        else:
+            expanded.append({k: _expand(v, pages) if isinstance(v, list) else v for k, v in entry.items()})
+    return expanded
 
 
 def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
@@ -52,6 +82,11 @@ def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
     for name, (title, modules) in API.items():
         text = "\n\n".join([f"# {title}", *(f"::: {module}" for module in modules)])
         files.append(File.generated(config, f"api/{name}.md", content=text))
+    for page, path in NOTEBOOKS.items():
+        text, images = convert_notebook(path)
+        files.append(File.generated(config, page, content=text))
+        for name, data in images.items():
+            files.append(File.generated(config, f"{FOLDER}/{name}", content=data))
     return files
 
 
@@ -73,7 +108,7 @@ def _public_names() -> str:
 def on_page_markdown(markdown: str, *, page: "Page", files: "Files", **_: Any) -> str:
     """Let every link lead to a page of the site, or name the file of the repository that it leads to."""
     uri = page.file.src_uri
-    in_repository = FROM_ROOT.get(uri, f"docs/{uri}")
+    in_repository = f"{FOLDER}/" if uri in NOTEBOOKS else FROM_ROOT.get(uri, f"docs/{uri}")
 
     def change(match: re.Match[str]) -> str:
         is_image, text, target, anchor = match[1], match[2], match[3], match[4] or ""
@@ -89,7 +124,45 @@ def on_page_markdown(markdown: str, *, page: "Page", files: "Files", **_: Any) -
         name = text.strip("`").rstrip("/")
         return f"`{path}`" if path.endswith(name) else f"{text} (`{path}`)"
 
-    return LINK.sub(change, markdown)
+    return indent_lists(LINK.sub(change, markdown))
+
+
+def indent_lists(markdown: str) -> str:
+    """Return Markdown in which what belongs to an item of a list is indented by four columns, for Python-Markdown.
+
+    On a code host it is indented as far as the text of the item, which is two columns after a bullet.
+    """
+    lines: list[str] = []
+    columns: list[int] = []  # of the texts of the items that a line is in
+    fence = ""
+    for line in markdown.split("\n"):
+        text = line.lstrip(" ")
+        indent = len(line) - len(text)
+        if fence:
+            fence = "" if text.startswith(fence) else fence
+        else:
+            while text and columns and indent < columns[-1]:
+                columns.pop()
+            fence = text[:3] if text[:3] in FENCES else ""
+        lines.append(" " * (4 * len(columns) + max(indent - (columns or [0])[-1], 0)) + text if text else "")
+        if not fence and (marker := ITEM.match(text)):
+            columns.append(indent + len(marker[0]))
+    return "\n".join(lines)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Make formulas MathML, and say where lines of a table's cell may end."""
+    return CELL.sub(lambda cell: wrap_cell(cell[0]), formulas_in_mathml(html))
+
+
+def wrap_cell(html: str) -> str:
+    """Return a cell in which a line may end within a long name, and not before a deviation.
+
+    It may end at a point, a slash or an underscore, and in the name of a commit, ``owner/repository@0123abc``.
+    """
+    html = html.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
+    html = COMMIT.sub(r"/<wbr>\1<wbr>@", html)
+    return LONG_NAME.sub(lambda name: re.sub(r"(?<=[\w\])])[./,=_](?=\w)", r"\g<0><wbr>", name[0]), html)
 
 
 def _pages_of(path: str) -> list[str]:
@@ -97,6 +170,8 @@ def _pages_of(path: str) -> list[str]:
     pages = [page for page, source in FROM_ROOT.items() if source == path]
     if path.startswith("docs/"):
         pages.append(path.removeprefix("docs/"))
+    if path.startswith(f"{FOLDER}/"):
+        pages.append(path.replace(".ipynb", ".md"))
     if path == "docs/measured":
         pages.append("measured/training.md")
     module = os.path.splitext(path)[0].replace("/", ".")

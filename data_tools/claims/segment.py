@@ -1,9 +1,9 @@
 """Claim ``segment/masks``: labels of a trained scene from masks with errors, over the bias to the background.
 
 The paper is FlashSplat, arXiv 2409.08270. Objects of the synthetic room are labelled from the exact masks of its
-training views, and from masks of which some are shifted by a few pixels or show no object at all, as a tracker's do
-that has lost it. Labels are drawn at held-out views and compared with the exact ids there, by intersection over union,
-the mean of the objects.
+training views, and from masks of which some are shifted by a few pixels, show no object at all, as a tracker's do
+that has lost it, or spill over the outlines of the objects. Labels are drawn at held-out views and compared with the
+exact ids there, by intersection over union, the mean of the objects.
 """
 
 import argparse
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.ndimage import distance_transform_edt
 
 from data_tools.claims import kit
 from data_tools.claims.kit.claim import OUT, declare, iterations, seeds
@@ -21,7 +22,7 @@ from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.segment.votes import assign_labels, count_votes, label_map
-from minisplat_ref.interface.palette import SERIES
+from minisplat_ref.interface.palette import MIDDLE_BLUE, SERIES
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.types import Gaussians, Ints
 
@@ -36,6 +37,8 @@ CONDITIONS = {
     "30 % lost": (0.0, 0.3),
 }
 """Shares of masks that are shifted and lost."""
+SPILLS = {"all grown by 2": (1.0, 2), "all grown by 4": (1.0, 4), "half grown by 6": (0.5, 6)}
+"""Shares of masks whose objects are grown, and by how many pixels."""
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -52,12 +55,12 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 
 def measure(made: SyntheticScene, gaussians: Gaussians, seed: int) -> list[dict[str, Any]]:
-    """Return the mean IoU for every condition and bias."""
+    """Return the mean IoU for every kind of masks and bias."""
     records = []
-    truth = [object_ids(ids) for ids in made.test_ids]
-    for name, (shifted, lost) in CONDITIONS.items():
-        rng = np.random.default_rng(seed)
-        masks = spoil([object_ids(ids) for ids in made.train_ids], shifted, lost, rng)
+    exact, truth = ([object_ids(ids) for ids in views] for views in (made.train_ids, made.test_ids))
+    kinds = {name: spoil(exact, *shares, np.random.default_rng(seed)) for name, shares in CONDITIONS.items()}
+    kinds |= {name: spill(exact, *spilt, np.random.default_rng(seed)) for name, spilt in SPILLS.items()}
+    for name, masks in kinds.items():
         cameras = (view.camera for view in made.scene.train_views)
         every = range(1 + len(OBJECTS))
         votes = count_votes(gaussians, SPLATTING, zip(cameras, masks, strict=True), every)
@@ -91,6 +94,19 @@ def shift(mask: Ints, y: int, x: int) -> Ints:
     return moved
 
 
+def spill(masks: list[Ints], share: float, pixels: float, rng: np.random.Generator) -> list[Ints]:
+    """Return masks of which a share, at random and rounded, has objects that are grown."""
+    grown = rng.permutation(len(masks))[: round(share * len(masks))]
+    return [grow(mask, pixels) if row in grown else mask for row, mask in enumerate(masks)]
+
+
+def grow(mask: Ints, pixels: float) -> Ints:
+    """Return a mask whose objects take what is background up to some pixels beside them, each what is nearest to it."""
+    distances, nearest = distance_transform_edt(mask == 0, return_indices=True)
+    found: Ints = np.where(distances <= pixels, mask[tuple(nearest)], 0)
+    return found
+
+
 def _at(bias: float) -> Callable[[dict[str, Any]], float | None]:
     return lambda record: record["iou"] if record["bias"] == bias else None
 
@@ -98,7 +114,8 @@ def _at(bias: float) -> Callable[[dict[str, Any]], float | None]:
 def draw(records: list[dict[str, Any]]) -> Figure:
     """Draw the mean IoU over the bias for every kind of masks."""
     figure, axes = subplots((6.5, 3.6))
-    plot_curves(axes, records, "bias", "iou", dict(zip(CONDITIONS, SERIES, strict=False)), key="masks")
+    colors = dict(zip((*CONDITIONS, *SPILLS), (*SERIES, MIDDLE_BLUE), strict=False))
+    plot_curves(axes, records, "bias", "iou", colors, key="masks")
     axes.set(title="Labels at held-out views", xlabel="bias to the background", ylabel="mean IoU")
     axes.legend()
     return figure
@@ -107,7 +124,7 @@ def draw(records: list[dict[str, Any]]) -> Figure:
 CLAIMS = (
     declare(
         "masks",
-        "labels at held-out views, from clean, shifted and lost masks, over the bias",
+        "labels at held-out views, from clean, shifted, lost and grown masks, over the bias",
         run,
         *(OUT, iterations(1000), seeds(3)),
     ),

@@ -1,19 +1,22 @@
 """The documentation: links that lead out of docs/, and docstrings in Markdown."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from data_tools import readme_figure, site
+from data_tools import readme_figure, site, site_notebooks
 from minisplat_ref.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 needs_notebooks = pytest.mark.skipif(
     (ROOT / "PKG-INFO").exists(), reason="a source distribution has no stored notebooks"
 )
-PAGES = {"index.md", "CONTRIBUTING.md", "GUIDE.md", "EXTENDING.md", "measured/speed.md", "measured/training.md"} | {
-    f"api/{name}.md" for name in site.API
+PAGES = {
+    *("index.md", "CONTRIBUTING.md", "GUIDE.md", "EXTENDING.md", "measured/speed.md", "measured/training.md"),
+    *(f"api/{name}.md" for name in site.API),
+    *("notebooks/00_reading_guide.md", "notebooks/01_covariance_and_projection.md"),
 }
 
 
@@ -32,7 +35,13 @@ def on_site(markdown, page):
         pytest.param(
             "index.md",
             "[Notebook 00](notebooks/00_reading_guide.ipynb)",
-            "Notebook 00 (`notebooks/00_reading_guide.ipynb`)",
+            "[Notebook 00](notebooks/00_reading_guide.md)",
+            marks=needs_notebooks,
+        ),
+        pytest.param(
+            "notebooks/00_reading_guide.md",
+            "[next](01_covariance_and_projection.ipynb), [guide](../docs/GUIDE.md)",
+            "[next](01_covariance_and_projection.md), [guide](../GUIDE.md)",
             marks=needs_notebooks,
         ),
         ("EXTENDING.md", "[`hits.py`](../minisplat_ref/reference/hits.py)", "[`hits.py`](api/reference.md)"),
@@ -44,6 +53,46 @@ def on_site(markdown, page):
 )
 def test_links_stay_on_the_site_or_become_paths(page, link, expected):
     assert on_site(f"see {link}, or not", page) == f"see {expected}, or not"
+
+
+def test_what_belongs_to_an_item_is_indented_for_python_markdown():
+    text = "- a\n  b\n\n  | t |\n\n  ```\n  x\n    - y\n  ```\n  - c\n    d\n"
+    expected = "- a\n    b\n\n    | t |\n\n    ```\n    x\n      - y\n    ```\n    - c\n        d\n"
+    assert site.indent_lists(text) == expected
+    assert site.indent_lists("1. a\n   b\n2. c\n\nend\n\n    code") == "1. a\n    b\n2. c\n\nend\n\n    code"
+
+
+def test_lines_of_a_cell_end_where_they_may():
+    assert site.wrap_cell("<td>1.0 ± 0.2 dB</td>") == "<td>1.0\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}0.2 dB</td>"
+    assert site.wrap_cell('<td><a href="b/c@0123abc">b/c@0123abc f.py</a></td>') == (
+        '<td><a href="b/c@0123abc">b/<wbr>c<wbr>@0123abc f.py</a></td>'
+    )
+    assert site.wrap_cell("<td><code>a_long.dotted/name=value</code></td>") == (
+        "<td><code>a_<wbr>long.<wbr>dotted/<wbr>name=<wbr>value</code></td>"
+    )
+    for kept in ('<td><a href="a.b/c.d/e.f/g.h">x</a></td>', "<td><code>a.b</code></td>"):
+        assert site.wrap_cell(kept) == kept
+
+
+def test_the_family_and_the_notebooks_are_listed():
+    config = SimpleNamespace(
+        nav=[{"Start": "index.md"}, {"F": ["FAMILY.md", "family/*.md"]}, {"N": ["notebooks/*.md"]}]
+    )
+    start, family, notebooks = site.on_config(config).nav
+    assert start == {"Start": "index.md"}
+    assert family["F"][:3] == ["FAMILY.md", "family/antialiasing.md", "family/analytic.md"]
+    assert {path.name for path in (ROOT / "docs" / "family").iterdir()} == {page[7:] for page in family["F"][1:]}
+    assert notebooks["N"] == [f"notebooks/{path.stem}.md" for path in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))]
+
+
+def test_formulas_become_mathml():
+    pytest.importorskip("latex2mathml", reason="of the extra [docs]")
+    html = site_notebooks.formulas_in_mathml(
+        r'<p><span class="arithmatex">\(a &lt; b\)</span></p><div class="arithmatex">\[\frac{1}{2}\]</div>'
+    )
+    assert html.count("<math") == 2 and "arithmatex" not in html and "<mo>&#x0003C;</mo>" in html
+    assert re.search(r'<div class="formula"><math [^>]*display="block"><mrow><mfrac>', html)
+    assert site_notebooks.formulas_in_mathml("<p>$5</p>") == "<p>$5</p>"
 
 
 @needs_notebooks

@@ -214,6 +214,6 @@ def _read_records(folder: Path, settings: Mapping[str, Any], nouns: str) -> list
     if not path.is_file():
         raise InputError(f"{folder} exists and is not of this claim: give another --out")
     first, *lines = path.read_text(encoding="utf-8").splitlines()
-    if json.loads(first) != settings:
+    if json.loads(first) != json.loads(json.dumps(settings)):  # a tuple is a list there
         raise InputError(f"{folder} holds {nouns} of {first}: give another --out, or the same settings")
     return [json.loads(line) for line in lines]

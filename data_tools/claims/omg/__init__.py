@@ -7,6 +7,7 @@ from data_tools.claims.kit.claim import (
     OUT,
     PLY,
     RESUMED_OUT,
+    RESUMED_SCENE,
     SEEDS,
     argument,
     declare,
@@ -17,7 +18,7 @@ from data_tools.claims.kit.claim import (
     scene,
     seeds,
 )
-from data_tools.claims.omg import distinctiveness, files
+from data_tools.claims.omg import distinctiveness, files, networks
 
 CLAIMS = (
     declare(
@@ -39,5 +40,14 @@ CLAIMS = (
             metavar="A,B",
             help="take these trainings of the recipe omg instead of training",
         ),
+    ),
+    declare(
+        "networks",
+        "quality without networks and codes, with networks, and with both",
+        networks.run,
+        *RESUMED_SCENE,
+        iterations(2000),
+        SEEDS,
+        description=f"Train the recipe omg without networks and codes, and with them. {CONTINUES}",
     ),
 )

@@ -1,10 +1,13 @@
 """Claim ``vdgs/floats`` (arXiv 2312.13729): PSNR at held-out views with as many floats, those of the network included.
 
 Harmonics alone train a Gaussian for each of N points of the scene, drawn at random. Each mode trains as many fewer as
-have the floats of its network and hash grid. Numbers stay, and all of the schedule else is that of the recipe.
+have the floats of its network and hash grid. One arm is without the hash grid, which is most of these floats: a network
+of the direction alone multiplies the opacities; that of an earlier commit of the released code reads the Gaussian's
+opacity besides. Numbers stay, and all of the schedule else is that of the recipe.
 """
 
 import argparse
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -16,10 +19,13 @@ from data_tools.claims.kit.tables import first, spread, table
 from data_tools.claims.vdgs.pane import floats_of
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.vdgs.model import (
+    NAME,
+    TABLE,
     VDGS,
     VIEW_DEPENDENT,
     colors_plus,
     colors_times,
+    initial_shared,
     opacity_plus,
     opacity_times,
 )
@@ -29,9 +35,10 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.schedule import Recipe, scale_recipe
-from minisplat_ref.types import Scene
+from minisplat_ref.types import Floats, Scene
 
 HARMONICS = "harmonics"
+NO_GRID = "opacity_times, direction alone"
 MODES = (opacity_times, opacity_plus, colors_times, colors_plus)
 FLOATS = 59  # of a Gaussian with harmonics of degree 3
 
@@ -40,7 +47,16 @@ def arms(iterations: int) -> dict[str, Recipe]:
     """Return the recipes by arm; none changes the number of Gaussians."""
     ours = VDGS._replace(representation=VIEW_DEPENDENT)
     recipes = {HARMONICS: GS_ACCEL} | {mode.__name__: configure(ours, modulation=mode) for mode in MODES}
+    recipes[NO_GRID] = VDGS._replace(representation=VIEW_DEPENDENT._replace(shared=direction_alone))
     return {name: scale_recipe(recipe, iterations)._replace(events=()) for name, recipe in recipes.items()}
+
+
+def direction_alone(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
+    """Return the shared parameters with a hash grid of one number, which all places read: one more bias."""
+    shared = initial_shared(scene, rng, modulation=opacity_times)
+    first = f"{NAME}_weights_0"
+    table = np.zeros((1, 1, 1), shared[TABLE].dtype)
+    return {**shared, TABLE: table, first: shared[first][: 3 + table.size]}
 
 
 def n_shared(scene: Scene, recipe: Recipe) -> int:

@@ -7,14 +7,20 @@ import pytest
 
 from compact import short_run
 from data_tools.claims.__main__ import main as measure_claim
+from data_tools.claims.omg import networks as networks_claim
 from measured_claims import measured
 from minisplat_ref import load_ply, load_scene, save_ply
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.omg import file as omg
 from minisplat_ref.extensions.omg import trained_file
 from minisplat_ref.extensions.omg.trained_file import read_training
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import action_name
 from minisplat_ref.types import Gaussians
 
 
@@ -60,3 +66,27 @@ def test_claim(folders, tmp_path, capsys):
     assert "textured half" in capsys.readouterr().out
     assert measure_claim(more) == 0  # continues: there is nothing left to measure
     assert json.loads((tmp_path / "out" / "result.json").read_text()) == result
+
+
+def test_arms_of_networks_leave_out_what_they_say():
+    """Of the recipe's events alone; all prune by distinctiveness."""
+    names = {arm: [action_name(event) for event in recipe.events] for arm, recipe in networks_claim.arms(3000).items()}
+    whole = names["networks and codes"]
+    assert whole == [action_name(event) for event in find_recipe("omg", 3000).events]
+    assert [name for name in whole if name not in names["networks"]] == ["start_codes", "round_centres"]
+    missing = [name for name in whole if name not in names["neither"]]
+    assert missing == ["start_networks", "start_codes", "round_centres", "write_fields"]
+    assert "prune_indistinct" in names["neither"]
+
+
+def test_claim_of_networks(folders, tmp_path):
+    """Without networks and codes it is the training whose events they are not; with both, the recipe."""
+    nook, _ = folders
+    command = ["omg/networks", str(nook), "--iterations", "60", "--seeds", "0", "--out", str(tmp_path / "out")]
+    records = {record["arm"]: record for record in measured(command)["records"]}
+    scene, recipe = load_scene(nook), find_recipe("omg", 60)
+    model = train(scene, recipe, seed=0).model
+    settings = RenderSettings(scene.background, renderer=recipe.renderer)
+    expected = evaluate(model, scene.test_views, settings).psnr
+    assert records["networks and codes"]["psnr"] == pytest.approx(expected, abs=1e-9)  # the same numbers
+    assert len({record["psnr"] for record in records.values()}) == 3

@@ -36,7 +36,7 @@ def test_the_claim_measures_what_it_says(monkeypatch):
 
 
 def test_blending_by_centres_makes_normals_lean_towards_the_camera():
-    """As docs/FAMILY.md says: on a sphere, the blended normal is nearer to the view than the true one."""
+    """As docs/family/reflective.md says: on a sphere, the blended normal is nearer to the view than the true one."""
     [camera, *_] = claim._cameras(np.random.default_rng(0))
     truth = claim.trace(camera, prefilter(claim.environment()))
     metal = claim.metal_of(claim.sphere_of(500, 0.0, np.random.default_rng(0)))

@@ -150,6 +150,10 @@ def test_from_the_command_line(room, tmp_path, capsys):
     ]
     assert all(r["unlike"] == "-" and r["psnr"] > 5 and r["floats"] > r["n_primitives"] for r in result["records"])
     assert (tmp_path / "out" / FIGURE).stat().st_size > 5000
+    with pytest.MonkeyPatch.context() as patch:  # all records are there
+        patch.setattr(relatives, "train", None)
+        assert measure_claim([*command, "--settings", "sky=true"]) == 0
+    assert measure_claim(command) == 2
 
 
 def test_arms_that_continue(room, tmp_path):

@@ -1,4 +1,4 @@
-"""Masks that are shifted and lost, intersection over union by hand, and a small run."""
+"""Masks that are shifted, lost and grown, intersection over union by hand, and a small run."""
 
 from functools import partial
 
@@ -29,6 +29,27 @@ def test_masks_are_shifted_and_lost():
     assert len(starts) == 4  # to either side, along both axes
 
 
+def test_objects_are_grown_over_the_background_alone():
+    """A disc around one pixel by hand; between two objects each pixel is that of the nearer."""
+    mask = np.zeros((7, 12), int)
+    mask[3, 3], mask[3, 8] = 1, 2
+    grown = claim.grow(mask, 2)
+    assert (grown == 1).sum() == (grown == 2).sum() == 13  # lattice points of a disc of radius 2
+    assert grown[1, 3] == grown[3, 5] == 1 and grown[3, 6] == 2 and grown[2, 5] == grown[1, 4] == 0
+    assert claim.grow(mask, 3)[3, 3:9].tolist() == [1, 1, 1, 2, 2, 2]
+    full = np.array([[1, 2]])
+    assert np.array_equal(claim.grow(full, 4), full)
+
+
+def test_a_share_of_masks_spills_over():
+    mask = np.zeros((9, 9), int)
+    mask[4, 4] = 3
+    spilt = claim.spill([mask] * 10, 0.3, 1, np.random.default_rng(1))
+    assert sorted(int((each == 3).sum()) for each in spilt) == [1] * 7 + [5] * 3
+    others = [claim.spill([mask] * 10, 0.3, 1, np.random.default_rng(seed)) for seed in range(20)]
+    assert len({tuple(int((each == 3).sum()) for each in spilt) for spilt in others}) > 10  # at random
+
+
 def test_iou_by_hand(monkeypatch):
     monkeypatch.setattr("data_tools.claims.kit.objects.OBJECTS", ((1,), (2,)))
     truth, found = np.array([[1, 1, 2, 0]]), np.array([[1, 2, 2, 2]])
@@ -37,10 +58,13 @@ def test_iou_by_hand(monkeypatch):
 
 def test_the_claim_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(claim, "CONDITIONS", {"clean": (0.0, 0.0), "30 % lost": (0.0, 0.3)})
+    monkeypatch.setattr(claim, "SPILLS", {"all grown by 2": (1.0, 2)})
     monkeypatch.setattr(claim, "BIASES", (0.0, 0.4))
     small = partial(make_scene, n_views=9, width=64, height=48, supersampling=1, n_points=2000)
     monkeypatch.setattr(claim, "make_scene", small)
     words = ["segment/masks", "--iterations", "40", "--seeds", "1", "--out", str(tmp_path / "s")]
     assert measure_claim(words) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| clean"))
-    assert float(line.split("|")[2].split()[0]) > 0.2
+    rows = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    found = {row[1].strip(): row[2].split()[0] for row in rows}
+    assert float(found["clean"]) > 0.2
+    assert found["all grown by 2"] != found["clean"] != found["30 % lost"]
