@@ -9,7 +9,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.texture_splat import EXTENSION, kernels, textures
+from minisplat_ref.extensions.texture_splat import EXTENSION, kernels, model, texel_kernels, textures
 from minisplat_ref.extensions.texture_splat.baking import Maps, bake
 from minisplat_ref.extensions.texture_splat.model import (
     CHANNELS,
@@ -140,6 +140,76 @@ def test_textures_of_another_size_show_the_same(rng):
         with_textures(surfels, rng, texels=0)
 
 
+# --- texels ---
+
+
+def look_at(g, backend=CPU, camera=None):
+    camera = make_camera(rng=np.random.default_rng(3)) if camera is None else camera
+    return discs.look(Model(g), view_from(camera), Request(backend=backend))
+
+
+def both_sides(rng, n, size):
+    """Surfels of both sides of the camera, turned anyhow; some of their texels are tilted by more than one holds."""
+    g = make_gaussians(rng, n, size=0.3)
+    g = g._replace(means=np.where(np.arange(n)[:, None] % 3 == 1, -g.means, g.means), quats=rng.normal(size=(n, 4)))
+    surfels = painted(with_textures(with_material(g, rng), rng, texels=size), rng)
+    return surfels._replace(normal_textures=surfels.normal_textures * rng.choice([0.3, 3], size=(n, 1)))
+
+
+def compare_texels(seen, v, tolerance):
+    """Compare kernels and NumPy, relative to the largest; return the texels and the gradient of the kernels."""
+    expected, found = model.read_textures(seen), texel_kernels.read_textures(seen)
+    v_expected, v_found = model.read_textures_vjp(seen, v), texel_kernels.read_textures_vjp(seen, v)
+    pairs = {"texels": (found, expected), "quats": (v_found.quats, v_expected.quats)}
+    pairs["R"] = v_found.cam_from_world_R, v_expected.cam_from_world_R
+    pairs |= {name: (v_found.fields[name], field) for name, field in v_expected.fields.items()}
+    assert v_found.fields.keys() == v_expected.fields.keys() == CHANNELS.keys()
+    for name, (ours, theirs) in pairs.items():
+        assert ours.shape == theirs.shape and (name == "R" or ours.dtype == theirs.dtype), name
+        assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(theirs).max(), err_msg=name)
+    return found, v_found
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_kernels_read_texels_as_numpy_does(size, rng):
+    """On both sides of discs, at tilts on both sides of the limit; culled surfels are 0 and take no gradient."""
+    g, v = both_sides(rng, 150, size), rng.normal(size=(150, size * size, 8))
+    seen = look_at(g)
+    is_seen = seen.surfels.radii[:, 0] > 0
+    tilts = np.sum(tangent_normals(g.normal_textures.reshape(150, -1, 2))[..., :2] ** 2, axis=-1)
+    sides = model.disc_axes(seen)[1][is_seen]
+    assert 40 < is_seen.sum() < 110 and 0.02 < (tilts[is_seen] > 0.99).mean() < 0.9 and np.unique(sides).size == 2
+    found, v_found = compare_texels(seen, v, PARITY_FLOAT64)
+    assert found[is_seen].all() and not found[~is_seen].any()
+    for field in (*v_found.fields.values(), v_found.quats):
+        assert field[is_seen].any(axis=1).all() and not field[~is_seen].any()
+
+
+def test_kernels_read_texels_in_float32(rng):
+    """Of a float32 model with logits where a sigmoid is next to 0 or 1, in its dtype."""
+    g = both_sides(rng, 60, 3)
+    g = as_dtype(g._replace(albedo_logits=g.albedo_logits * rng.choice([1, 15, 100], size=(60, 1))), np.float32)
+    found, v_found = compare_texels(look_at(g), rng.normal(size=(60, 9, 8)).astype(np.float32), PARITY_FLOAT32_IMAGE)
+    assert found.dtype == v_found.quats.dtype == np.float32 and np.isfinite(found).all()
+    assert all(np.isfinite(field).all() for field in v_found.fields.values())
+
+
+def test_kernels_read_texels_of_few_surfels(rng):
+    """One surfel, none in sight and none at all; textures of zeros are the disc's normal and one half."""
+    flat = one_disc(0.5, 3, rng)
+    flat = flat._replace(**{name: np.zeros_like(getattr(flat, name)) for name in CHANNELS})
+    seen = look_at(flat, camera=make_camera())
+    found, v_found = compare_texels(seen, rng.normal(size=(1, 9, 8)), PARITY_FLOAT64)
+    assert_allclose(found[0, :, :3], np.broadcast_to(seen.surfels.normals, (9, 3)), atol=CLOSED_FORM)
+    assert_array_equal(found[0, :, 3:], 0.5)
+    behind = look_at(flat._replace(means=-flat.means), camera=make_camera())
+    found, v_found = compare_texels(behind, rng.normal(size=(1, 9, 8)), PARITY_FLOAT64)
+    assert not found.any() and not v_found.cam_from_world_R.any() and not v_found.quats.any()
+    none = TexturedSurfels(*(field[:0] for field in flat))
+    assert texel_kernels.read_textures(look_at(none)).shape == (0, 9, 8)
+    assert not texel_kernels.read_textures_vjp(look_at(none), np.zeros((0, 9, 8))).cam_from_world_R.any()
+
+
 # --- blending ---
 
 
@@ -170,6 +240,28 @@ def test_kernels_and_reference_agree(size, opacity, rng):
     assert_allclose(image, expected, atol=PARITY_FLOAT32_IMAGE * np.abs(expected).max())
     v_single = kernels.blend_texels_vjp(surfels, single, bins, conventions, image, v)
     assert_allclose(v_single.texels, v_expected.texels, atol=PARITY_FLOAT32_GRADIENT * np.abs(v_expected.texels).max())
+
+
+def test_hidden_surfels_have_no_gradient_of_texels(rng, monkeypatch):
+    """Discs as wide as the image: those behind some opaque ones have slots that no hit has opened, here full of NaN."""
+    g, camera = make_gaussians(rng, 12, size=3, opacity_logit=8.0), make_camera(rng=rng)
+    texels, v = rng.normal(size=(12, 4, 8)), rng.normal(size=(18, 24, 8))
+    surfels, bins, conventions = listed(g, camera, CPU)
+    image = textures.blend_texels(surfels, texels, bins, conventions)
+    kept, Slots = [], kernels.Slots
+
+    def keep(*fields):
+        fields[1].fill(np.nan)
+        kept.append(Slots(*fields))
+        return kept[-1]
+
+    monkeypatch.setattr(kernels, "Slots", keep)
+    found = kernels.blend_texels_vjp(surfels, texels, bins, conventions, image, v).texels
+    expected = textures.blend_texels_vjp(surfels, texels, bins, conventions, image, v).texels
+    is_hidden = ~expected.any(axis=(1, 2)) & (np.diff(bins.gaussian_offsets) > 0)
+    assert is_hidden.any() and kept[0].is_hit.any() and not kept[0].is_hit.all()
+    assert_allclose(found, expected, atol=PARITY_FLOAT64 * np.abs(expected).max())
+    assert not found[is_hidden].any()
 
 
 def test_the_whole_renderer_has_its_gradient(backend):

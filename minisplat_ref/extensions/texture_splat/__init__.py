@@ -18,7 +18,7 @@ the solution of a linear least-squares problem (:mod:`.baking`).
     python -m data_tools.claims texture-splat/bricks --out DIR
     minisplat-ref oracle gradients --extension texture-splat
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/texture-splat.md`` has the measured figures.
 
 Dates, rates and the 4 x 4 texels are those of the released code, in which this is the fourth stage of a training of
 60,000 iterations, from 30,000 on; here it is a training of its own. This deviates from the code as follows. Texels hold

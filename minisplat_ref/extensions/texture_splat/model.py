@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.texture_splat import kernels, textures
+from minisplat_ref.extensions.texture_splat import kernels, texel_kernels, textures
 from minisplat_ref.extensions.texture_splat.textures import (
     N_CHANNELS,
     REACH,
@@ -195,7 +195,10 @@ class TextureTape(NamedTuple):
 
 
 def read_textures(seen: discs.Seen) -> Floats:
-    """Return normals, in the camera's frame and towards it, and materials of all texels, [N, T^2, 8]."""
+    """Return normals, in the camera's frame and towards it, and materials of texels, [N, T^2, 8].
+
+    Those of a surfel that is culled are 0.
+    """
     g, n, dtype = seen.gaussians, len(seen.gaussians.means), seen.gaussians.means.dtype
     size = count_texels(g)
     texels = np.empty((n, size * size, N_CHANNELS), dtype)
@@ -205,6 +208,7 @@ def read_textures(seen: discs.Seen) -> Floats:
     texels[:, :, :3] = np.moveaxis(tilted + seen.surfels.normals[:, :, None] * z, 1, 2)
     texels[:, :, 3:6] = sigmoid(_split_texels(g.albedo_logits, 3))
     texels[:, :, 6], texels[:, :, 7] = sigmoid(g.metallic_logits), sigmoid(g.roughness_logits)
+    texels[seen.surfels.radii[:, 0] == 0] = 0
     return texels
 
 
@@ -220,6 +224,7 @@ def read_textures_vjp(seen: discs.Seen, v_texels: Floats) -> shaded.MaterialGrad
     g, dtype = seen.gaussians, seen.gaussians.means.dtype
     raw = _split_texels(g.normal_textures, 2)
     axes, signs = disc_axes(seen)
+    v_texels = np.where(seen.surfels.radii[:, :1, None] > 0, v_texels, 0)
     v_n = v_texels[:, :, :3] * signs[:, None]  # [N, T^2, 3]
     v_raw = tangent_normals_vjp(raw, v_n @ axes)
     v_axes = np.swapaxes(v_n, 1, 2) @ tangent_normals(raw)  # [N, 3, 3], columns
@@ -287,7 +292,14 @@ def blend_vjp(tape: TextureTape, v_image: Floats, v_alpha: Floats | None) -> tup
     return v._replace(surfels=moved, carried=v_texels), v_further
 
 
-TEXTURES = shaded.Materials(read_textures, read_textures_vjp, blend, blend_vjp)
+def materials_on(backend: Backend, size: int) -> shaded.Materials:
+    """Return textures of ``size`` x ``size`` texels as materials, read and blended as a backend does.
+
+    One texel is read in NumPy, as the material of a surfel is, so that both give the same numbers.
+    """
+    if backend.is_compiled and size > 1:
+        return shaded.Materials(texel_kernels.read_textures, texel_kernels.read_textures_vjp, blend, blend_vjp)
+    return shaded.Materials(read_textures, read_textures_vjp, blend, blend_vjp)
 
 
 def render_textured(
@@ -299,7 +311,8 @@ def render_textured(
     """
     stage = np.maximum(model.shared[STAGE], PER_PIXEL) if STAGE in model.shared else None
     deferred = model if stage is None else model._replace(shared={**model.shared, STAGE: stage})
-    return shaded.render_reflective(deferred, view, request, visibility, mirrors=True, materials=TEXTURES)
+    materials = materials_on(request.backend, count_texels(model.gaussians))
+    return shaded.render_reflective(deferred, view, request, visibility, mirrors=True, materials=materials)
 
 
 def disc_axes(seen: discs.Seen) -> tuple[Floats, Floats]:

@@ -167,7 +167,7 @@ def measure_rays(surfels: Surfels, bins: TileBins, conventions: Conventions, dty
     forward_kernel(response)(
         _primitives(response, surfels, dtype),
         pack_lists(bins, response),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         n_threads(),
         out,
     )
@@ -192,7 +192,7 @@ def measure_rays_vjp(
     backward_kernel(response)(
         _primitives(response, surfels, dtype),
         pack_lists(bins, response),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         n_threads(),
         out,
         np.column_stack([np.ravel(v_median), np.ravel(v_distortion)]).astype(dtype),
