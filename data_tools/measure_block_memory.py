@@ -63,11 +63,12 @@ def _evens(lines: list[str]) -> Iterable[int]:
 
 
 def peaks(folder: Path) -> Iterator[tuple[str, int, float]]:
-    """Yield of each training of a folder its name, its Gaussians, and the memory of its process, MB."""
+    """Yield of each process of a training in blocks its name, its Gaussians, and its memory at most, MB."""
     plan, asked = load_plan(folder), load_block_training(folder)
     assert plan is not None
-    for name in (COARSE, *(planned.block.name for planned in plan.blocks)):
-        metrics = run_folder.read_json_object(asked.run_folder_for(name) / run_folder.METRICS)
+    names = (COARSE, *(planned.block.name for planned in plan.blocks))
+    for name, run in (*((name, asked.run_folder_for(name)) for name in names), ("plan and merge", folder)):
+        metrics = run_folder.read_json_object(run / run_folder.METRICS)
         yield name, metrics["n_gaussians"], metrics["peak_rss_mb"]
 
 
@@ -88,7 +89,7 @@ def main() -> None:
     n_bytes = sum(path.stat().st_size for path in (scene / MODEL).iterdir())
     print(f"{args.scene}, {n:,} observations, model of {n_bytes / 1e6:.0f} MB; {describe_machine()}\n")
     rows = [[name, f"{n_gaussians:,}", f"{megabytes:.0f}"] for name, n_gaussians, megabytes in peaks(run)]
-    print(markdown_table(("training", "Gaussians", "peak memory (MB)"), rows))
+    print(markdown_table(("process", "Gaussians", "peak memory (MB)"), rows))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Measure what training in blocks costs: PSNR beside that of the whole, at seams and elsewhere, time and memory.
 
-``python -m data_tools.measure_blocks SCENE --blocks 2x2 --iterations 2400 --seeds 0,1,2 --out DIR`` trains the whole,
-blocks in which each photograph is shown as often as in the whole, and blocks of as many iterations in all, for each
-seed, and prints a table: mean and standard deviation over the seeds. Training continues where it was cut off.
+``python -m data_tools.measure_blocks SCENE --blocks 2x2 --iterations 2400 --seeds 0,1,2 --out DIR`` trains the whole
+and blocks, in which each photograph is shown as often, for each seed, and prints a table: mean and standard deviation
+over the seeds. If the blocks of the first seed took over a tenth more processor time, it also trains shorter ones,
+which take as much as the whole. Training continues where it was cut off.
 
 A pixel of a test view belongs to a seam if the Gaussian that weighs most in it, in the model of the whole, is nearer to
 an edge between cores than a twentieth of the cameras' reach.
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.blocks.plan import COARSE, Plan, load_block_training, load_plan
+from minisplat_ref.app.blocks.plan import COARSE, Plan, count_iterations, load_block_training, load_plan
 from minisplat_ref.app.blocks.train import is_unfinished
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.app.runs.scoring import load_trained
@@ -28,6 +29,8 @@ from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.types import Bools, Floats, View
 
 BAND = 0.05  # of the cameras' reach
+SHARE_MIN = 1 / 1.1  # of the blocks' processor time in that of the whole, below which shorter ones are trained, too
+CPU_TIME, SHORTER = "train_cpu_seconds", "blocks of the same processor time"
 HEADING = (
     *("training", "iterations", "processor s", "Gaussians", "PSNR (dB)", "SSIM"),
     *("at seams (dB)", "elsewhere (dB)", "largest process (MB)"),
@@ -40,6 +43,8 @@ class Trained(NamedTuple):
     folder: Path
     parts: tuple[Path, ...]
     """Run folders of all trainings that made it."""
+    iterations: int
+    """Of all these together."""
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -65,9 +70,10 @@ def train(folder: Path, words: list[str]) -> Trained:
         subprocess.run([sys.executable, "-m", "minisplat_ref", "train", *command], check=True)
     plan = load_plan(folder) if (folder / run_folder.BLOCKS).exists() else None
     if plan is None:
-        return Trained(folder, (folder,))
+        return Trained(folder, (folder,), run_folder.read_json_object(folder / run_folder.METRICS)["iterations"])
     names = [COARSE, *(planned.block.name for planned in plan.blocks)]
-    return Trained(folder, tuple(load_block_training(folder).run_folder_for(name) for name in names))
+    training = load_block_training(folder)
+    return Trained(folder, tuple(map(training.run_folder_for, names)), count_iterations(training, plan))
 
 
 def seam_errors(trained: Trained, whole: Trained, plan: Plan) -> tuple[float, float]:
@@ -112,7 +118,7 @@ def _renderer(folder: Path, background: Floats) -> Any:
 def row_of(trained: Trained, seams: tuple[float, float]) -> list[float]:
     """Return the numbers of one training, in the order of HEADING."""
     metrics = trained.metrics
-    numbers = [trained.sum_of("iterations"), trained.sum_of("train_cpu_seconds"), metrics["n_gaussians"]]
+    numbers = [trained.iterations, trained.sum_of(CPU_TIME), metrics["n_gaussians"]]
     return [*numbers, metrics["psnr"], metrics["ssim"], *seams, trained.peak_mb]
 
 
@@ -128,6 +134,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     rows: dict[str, list[list[float]]] = {}
+    fewer: int | None = None
     for seed in args.seeds.split(","):
         words = [args.scene, "--recipe", args.recipe, "--downscale", args.downscale, "--seed", seed]
         whole = train(args.out / f"whole-{seed}", [*words, "--iterations", str(args.iterations)])
@@ -135,10 +142,12 @@ def main() -> None:
         often = train(args.out / f"often-{seed}", [*words, "--iterations", str(args.iterations)])
         plan = load_plan(often.folder)
         assert plan is not None
-        fewer = round(args.iterations**2 / often.sum_of("iterations"))
-        equal = train(args.out / f"equal-{seed}", [*words, "--iterations", str(fewer)])
-        names = ("whole", "blocks, each photograph as often", "blocks, as many iterations")
-        for name, trained in zip(names, (whole, often, equal), strict=True):
+        arms = {"whole": whole, "blocks": often}
+        if not rows and (share := whole.sum_of(CPU_TIME) / often.sum_of(CPU_TIME)) < SHARE_MIN:
+            fewer = round(args.iterations * share)
+        if fewer is not None:
+            arms[SHORTER] = train(args.out / f"shorter-{seed}", [*words, "--iterations", str(fewer)])
+        for name, trained in arms.items():
             rows.setdefault(name, []).append(row_of(trained, seam_errors(trained, whole, plan)))
     print(f"{args.scene}, {args.blocks} blocks, seeds {args.seeds}; {describe_machine()}\n")
     print(markdown_table(HEADING, [[name, *_cells(np.array(values))] for name, values in rows.items()]))

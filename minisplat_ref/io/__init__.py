@@ -10,7 +10,7 @@ from minisplat_ref.io.inventory import warn_of_unused
 from minisplat_ref.io.llff import POSES_BOUNDS, is_llff, list_llff
 from minisplat_ref.io.other_places import refuse_other_scene
 from minisplat_ref.io.ply import load_ply, load_points, save_ply
-from minisplat_ref.io.scene import Listing, build_reading, build_scene
+from minisplat_ref.io.scene import TEST_EVERY, Listing, build_reading, build_scene
 from minisplat_ref.io.transforms import (
     BLENDER_FILES,
     SINGLE_FILE,
@@ -36,7 +36,7 @@ def load_scene(
     path: str | Path,
     *,
     downscale: int = 1,
-    test_every: int = 8,
+    test_every: int = TEST_EVERY,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
     as_photographed: bool = False,

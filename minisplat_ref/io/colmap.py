@@ -3,13 +3,13 @@
 Poses follow COLMAP's convention, which is also ours: cam_from_world, OpenCV axes, the centre of the top-left pixel at
 (0.5, 0.5). Masks are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) or at
 ``masks/<name>.png``. An alpha channel is a mask too. A point's track lists the views that see it. Left out: 2D
-features, and images that COLMAP could not register.
+features (:mod:`.colmap_light`), and images that COLMAP could not register.
 """
 
 import re
-import struct
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.io.colmap_text import read_text, readable, text_names
+from minisplat_ref.io.colmap_light import without_features
+from minisplat_ref.io.colmap_records import LAYOUTS, check_records, read_records
+from minisplat_ref.io.colmap_text import readable, text_lines, text_names
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
 from minisplat_ref.io.names import name_inside, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, PointCloud, load_points
-from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing, split_photos
+from minisplat_ref.io.scene import TEST_EVERY, Listing, Photo, build_reading, build_scene, make_listing, split_photos
 from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
@@ -33,33 +35,24 @@ POINTS_PLY = "points3D.ply"  # which 3DGS and its viewers write beside the model
 N_IMAGES = re.compile(r"# Number of images: (\d+)")  # in a model as text
 
 
-class Records(NamedTuple):
-    """Layout of a binary file of COLMAP: a count of records, each fixed bytes, a name, and a counted list of items."""
-
-    n_fixed: int
-    """Bytes before the name or the count."""
-    has_name: bool
-    """Whether a zero-terminated name follows."""
-    count_format: str
-    """Of the number of items, for :mod:`struct`."""
-    n_item: int
-    """Bytes of an item."""
-
-
-BINARY_RECORDS = {
-    "images.bin": Records(n_fixed=64, has_name=True, count_format="<Q", n_item=24),
-    "points3D.bin": Records(n_fixed=43, has_name=False, count_format="<Q", n_item=8),
-    "frames.bin": Records(n_fixed=64, has_name=False, count_format="<I", n_item=16),
-}
 # Errors of pycolmap for damaged files: from its own checks, and when it takes garbage for an id or a count.
-DAMAGE_ERRORS = (ValueError, IndexError, RuntimeError, MemoryError, OSError)
+DAMAGE_ERRORS = (ValueError, IndexError, OverflowError, RuntimeError, MemoryError, OSError)
+
+
+class LightModel(NamedTuple):
+    """A model without its 2D features."""
+
+    reconstruction: Any
+    """A ``pycolmap.Reconstruction``, whose points have no tracks."""
+    seen: Mapping[int, Ints] | None
+    """Of :func:`.colmap_light.without_features`."""
 
 
 def load_colmap(
     path: str | Path,
     *,
     downscale: int = 1,
-    test_every: int = 8,
+    test_every: int = TEST_EVERY,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
     as_photographed: bool = False,
@@ -104,9 +97,9 @@ def load_colmap(
 
 def list_colmap(path: Path, test_every: int, model: str | None = None, offset: int = 0) -> Listing:
     """Return all that :func:`load_colmap` reads but the photographs; ``offset`` as for :func:`split_photos`."""
-    reconstruction = read_model(path, model)
-    train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every, offset)
-    points, colors = _points(reconstruction)
+    light = _read_light(_model_folder(path, model))
+    train_photos, test_photos = split_photos(_photos(path, light), test_every, offset)
+    points, colors = _points(light.reconstruction)
     if not len(points):
         points, colors = _points_beside(path, find_model(path, model))
     return make_listing(path, train_photos, test_photos, points, colors, alpha_is_mask=True)
@@ -171,42 +164,72 @@ def image_names(model: Path) -> set[str]:
     """
     binary, text = model / "images.bin", model / "images.txt"
     if (model / "cameras.bin").is_file():
-        content = binary.read_bytes() if binary.is_file() else b""
-        return {name.decode(errors="replace") for _, name in _records(binary, content, BINARY_RECORDS["images.bin"])}
+        return {r.name.decode(errors="replace") for r in read_records(binary)} if binary.is_file() else set()
     return set(text_names(text).values()) if text.is_file() else set()
 
 
 def read_model(path: Path, name: str | None = None) -> Any:
-    """Read the COLMAP model of the scene at ``path`` as a ``pycolmap.Reconstruction``; ``name`` as for find_model."""
+    """Read all of the COLMAP model of a scene, with its 2D features, as a ``pycolmap.Reconstruction``.
+
+    Parameters
+    ----------
+    path : Path
+        The scene.
+    name : str, optional
+        As for :func:`find_model`.
+
+    Raises
+    ------
+    InputError
+        There is no model, or it is damaged.
+    """
+    model = _model_folder(path, name)
+    with _readable(model) as folder:
+        reconstruction = import_pycolmap().Reconstruction(str(folder))
+    return _checked(reconstruction, model)
+
+
+def _model_folder(path: Path, name: str | None = None) -> Path:
+    """Return the folder of the model of a scene, which must have one; ``name`` as for find_model."""
     model = find_model(path, name)
     if model is None:
         raise InputError(
             f"{path}: no COLMAP model, looked for cameras.bin or cameras.txt in {' and '.join(MODEL_FOLDERS)};"
             f" to make one from photographs run `minisplat-ref sfm PHOTOS --out {path}`"
         )
-    return _read_folder(model)
+    return model
 
 
-def _read_folder(model: Path) -> Any:
-    """Read the model in a folder."""
-    is_binary = (model / "cameras.bin").is_file()
-    if is_binary:
-        for name, layout in BINARY_RECORDS.items():
+def _read_light(model: Path) -> LightModel:
+    """Read the model in a folder without its 2D features."""
+    with _readable(model) as folder, without_features(folder) as (light, seen):
+        reconstruction = import_pycolmap().Reconstruction(str(light))
+    return LightModel(_checked(reconstruction, model), seen)
+
+
+@contextmanager
+def _readable(model: Path) -> Iterator[Path]:
+    """Give a folder of a model that pycolmap can read, whose files end where they should; say it if it cannot."""
+    if (model / "cameras.bin").is_file():
+        for name in LAYOUTS:
             if (model / name).is_file():
-                _check_records(model / name, layout)
+                check_records(model / name)
     elif (model / "images.txt").is_file():
         _check_text_images(model / "images.txt")
-    pycolmap = import_pycolmap()
     try:
         with readable(model) as folder:
-            reconstruction = pycolmap.Reconstruction(str(folder))
+            yield folder
     except DAMAGE_ERRORS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{model}: damaged or incomplete COLMAP model ({reason}); copy or export it again") from None
-    if is_binary:
+
+
+def _checked(reconstruction: Any, model: Path) -> Any:
+    """Refuse a model with too few cameras, which pycolmap does not notice, and give images the names that they have."""
+    if (model / "cameras.bin").is_file():
         size = 8 + sum(24 + 8 * len(camera.params) for camera in reconstruction.cameras.values())
         found = (model / "cameras.bin").stat().st_size
-        if found < size:  # pycolmap does not notice
+        if found < size:
             raise InputError(f"{model / 'cameras.bin'}: truncated, {found} of {size} bytes; copy or export it again")
     else:
         for image_id, text in text_names(model / "images.txt").items():
@@ -223,14 +246,18 @@ def write_model(path: Path, folder: Path) -> None:
     reconstruction.write_binary(str(folder))
 
 
-def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
-    """List the registered images of a model, in no particular order."""
-    folder = image_folder(path)
-    seen = _point_ids(reconstruction)
+def colmap_photos(path: Path) -> list[Photo]:
+    """List the registered images of the model of a scene, in no particular order."""
+    return _photos(path, _read_light(_model_folder(path)))
+
+
+def _photos(path: Path, model: LightModel) -> list[Photo]:
+    """List the registered images of a model."""
+    folder, images = image_folder(path), model.reconstruction.images
     masks = _mask_files(folder.with_name("masks"))
-    names = {image_id: _name(path, image) for image_id, image in reconstruction.images.items()}
-    registered = [(names[image_id], image) for image_id, image in reconstruction.images.items() if image.has_pose]
-    return [_photo(path, folder, name, image, seen, masks) for name, image in registered]
+    names = {image_id: _name(path, image) for image_id, image in images.items()}
+    registered = [(names[image_id], image) for image_id, image in images.items() if image.has_pose]
+    return [_photo(path, folder, name, image, model.seen, masks) for name, image in registered]
 
 
 def _name(path: Path, image: Any) -> str:
@@ -262,7 +289,7 @@ def model_cameras(folder: Path) -> dict[str, tuple[Camera, Lens | None]]:
     InputError
         The model is damaged, or a camera has no pinhole view.
     """
-    images = _read_folder(folder).images.values()
+    images = _read_light(folder).reconstruction.images.values()
     return {
         name: (_camera(folder, name, image), _lens(image.camera))
         for name, image in ((_name(folder, image), image) for image in images if image.has_pose)
@@ -308,24 +335,9 @@ def _lens(camera: Any) -> Lens | None:
     return None if name in PINHOLE_MODELS or has_zero_distortion else Lens(name, tuple(params.tolist()))
 
 
-def _sort_points(reconstruction: Any) -> list[Any]:
-    """Return the sparse points by ascending id, so that the order does not depend on the file's."""
-    return [point for _, point in sorted(reconstruction.points3D.items())]
-
-
-def _point_ids(reconstruction: Any) -> dict[int, Ints] | None:
-    """Return the rows of the points that each image sees, by the image's id; None for a model without tracks."""
-    rows: dict[int, list[int]] = {}
-    for row, point in enumerate(_sort_points(reconstruction)):
-        for element in point.track.elements:
-            rows.setdefault(element.image_id, []).append(row)
-    # An image may have matched a point twice.
-    return {image_id: np.unique(np.array(ids, np.int64)) for image_id, ids in rows.items()} if rows else None
-
-
 def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
-    """Return the sparse points and their colours, [P, 3] each."""
-    points = _sort_points(reconstruction)
+    """Return the sparse points and their colours, [P, 3] each, by their numbers and not as they are in the file."""
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
     positions = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 
@@ -346,21 +358,23 @@ def _check_text_images(file: Path) -> None:
     An image takes two lines, the second of which lists its 2D features and is empty if there are none. Where a program
     has left out empty lines, pycolmap takes every second image for the features of the one before.
     """
-    lines = read_text(file).splitlines()
-    # Features are triples of numbers; an image has nine numbers and a name.
-    n_images = sum(len(line.split()) % 3 != 0 for line in lines if not line.startswith("#"))
-    n_read = 0
-    rest = iter(lines)
-    for line in rest:
-        if line.strip() and not line.startswith("#") and next(rest, None) is not None:
-            n_read += 1
+    n_images = n_read = n_stated = 0
+    of_features = False  # the next line
+    for line in text_lines(file):
+        is_comment = line.startswith("#")
+        # Features are triples of numbers; an image has nine numbers and a name.
+        n_images += not is_comment and len(line.split()) % 3 != 0
+        heading = N_IMAGES.match(line)
+        n_stated = n_stated or (int(heading[1]) if heading else 0)
+        if of_features:
+            n_read, of_features = n_read + 1, False
+        else:
+            of_features = bool(line.strip()) and not is_comment
     if n_read < n_images:
         raise InputError(
             f"{file}: {n_images} images, of which {n_read} can be read: each needs a second line with its 2D features,"
             " empty if it has none; add the empty lines, or export the model as binary"
         )
-    headings = (N_IMAGES.match(line) for line in lines)
-    n_stated = next((int(heading[1]) for heading in headings if heading is not None), n_read)
     if n_read < n_stated:
         warnings.warn(
             one_line(
@@ -370,34 +384,3 @@ def _check_text_images(file: Path) -> None:
             InputWarning,
             stacklevel=4,
         )
-
-
-def _check_records(file: Path, layout: Records) -> None:
-    """Check the records of a binary file before pycolmap reads it, which takes missing bytes for counts and hangs."""
-    for _ in _records(file, file.read_bytes(), layout):
-        pass
-
-
-def _records(file: Path, content: bytes, layout: Records) -> Iterator[tuple[int, bytes]]:
-    """Yield the offset and the name, empty without one, of each record of a binary file.
-
-    Raises
-    ------
-    InputError
-        The file ends before its last record.
-    """
-    offset = 8
-    try:
-        for _ in range(struct.unpack_from("<Q", content)[0]):
-            begin, name = offset, b""
-            offset += layout.n_fixed
-            if layout.has_name:
-                end = content.index(b"\0", offset)
-                name, offset = content[offset:end], end + 1
-            (n_items,) = struct.unpack_from(layout.count_format, content, offset)
-            offset += struct.calcsize(layout.count_format) + n_items * layout.n_item
-            yield begin, name
-    except (struct.error, ValueError, OverflowError):  # the last of an offset that is no index
-        offset = len(content) + 1
-    if offset > len(content):
-        raise InputError(f"{file}: truncated at {len(content)} bytes; copy or export it again")

@@ -38,18 +38,26 @@ def readable(model: Path) -> Iterator[Path]:
         yield Path(temporary)
 
 
-def _without_mark(file: Path) -> bytes | None:
-    """Return the content of a text file in UTF-8 without its byte order mark; None if it has none."""
+def _encoding(file: Path) -> str | None:
+    """Return the encoding that a text file's byte order mark names; None if it has none."""
     with file.open("rb") as opened:
         start = opened.read(4)
-    encoding = next((encoding for mark, encoding in BYTE_ORDER_MARKS if start.startswith(mark)), None)
+    return next((encoding for mark, encoding in BYTE_ORDER_MARKS if start.startswith(mark)), None)
+
+
+def _without_mark(file: Path) -> bytes | None:
+    """Return the content of a text file in UTF-8 without its byte order mark; None if it has none."""
+    encoding = _encoding(file)
     return None if encoding is None else file.read_bytes().decode(encoding, errors="replace").encode()
 
 
-def read_text(file: Path) -> str:
-    """Return the content of a text file; bytes that are no text become lone surrogates."""
-    content = _without_mark(file)
-    return (file.read_bytes() if content is None else content).decode("utf-8", errors="surrogateescape")
+def text_lines(file: Path) -> Iterator[str]:
+    """Yield the lines of a text file without their ends; bytes that are no text become lone surrogates."""
+    encoding = _encoding(file)
+    errors = "surrogateescape" if encoding is None else "replace"
+    with file.open(encoding=encoding or "utf-8", errors=errors) as opened:
+        for line in opened:
+            yield line.removesuffix("\n")
 
 
 def text_names(file: Path) -> dict[int, str]:
@@ -59,7 +67,7 @@ def text_names(file: Path) -> dict[int, str]:
     features, is passed over.
     """
     names = {}
-    lines = iter(read_text(file).splitlines())
+    lines = text_lines(file)
     for line in lines:
         words = line.split(maxsplit=N_BEFORE_NAME)
         if not words or words[0].startswith("#"):

@@ -4,7 +4,8 @@ A camera is described in the cylinder about the scene's axis, which is at right 
 images and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius,
 height and viewing direction of the training cameras near that angle, so that it stays where the scene was photographed:
 beyond, no photograph has constrained the Gaussians. Where more than a quarter of the circle was never photographed, the
-path leaves it out, and goes there and back along the rest.
+path leaves it out, and goes there and back along the rest. Where the cameras are those of a walk, it goes there and
+back along that instead (:mod:`.walks`).
 """
 
 import math
@@ -15,6 +16,7 @@ import numpy as np
 
 from minisplat_ref.io.upright import MINUS_Y, find_up
 from minisplat_ref.io.viewpoints import Viewpoint
+from minisplat_ref.io.walks import is_walk, way_along
 from minisplat_ref.types import Camera, Floats
 
 FOV = math.radians(50.0)  # horizontal, around a point cloud
@@ -35,23 +37,23 @@ def orbit(
     arc: float | None = None,
     up: Floats | None = None,
 ) -> list[Viewpoint]:
-    """Return the cameras of a closed path around the scene.
+    """Return the cameras of a closed path around the scene, or along a walk.
 
     Parameters
     ----------
     means : ndarray of shape (N, 3)
         Centres of the Gaussians, world frame.
     like : sequence of Viewpoint
-        Training cameras, which the path follows. Without any, it is a circle around the median of the means, so wide
-        that nine tenths of them are in the image.
+        Training cameras in the order of their photographs, which the path follows. Without any, it is a circle around
+        the median of the means, so wide that nine tenths of them are in the image.
     n_frames : int
         Number of cameras.
     width, height : int
         Image size, pixels.
     arc : float, optional
         Angle that the path covers, radians, centred on the middle of the training cameras. Less than a full circle is
-        travelled there and back. By default the angle that the training cameras cover, or the full circle, and the path
-        begins at one of them.
+        travelled there and back. By default the angle that the training cameras cover, or the full circle, or a walk,
+        and the path begins at one of them.
     up : ndarray of shape (3,), optional
         What is up, world frame; by default what :func:`.upright.find_up` finds, or without cameras -y (the y axis of
         COLMAP scenes points down).
@@ -70,12 +72,13 @@ def orbit(
         middle = 0.5 * (first + last)
         first, last = (first, first + FULL_CIRCLE) if arc >= FULL_CIRCLE else (middle - 0.5 * arc, middle + 0.5 * arc)
     begin = None if arc is not None or not cameras else _step_to_camera(path, first)
+    way = way_along(cameras) if arc is None and is_walk(cameras, _off_circle(path)) else None
     viewpoints = []
     for frame in range(n_frames):
         time = frame / n_frames
-        is_closed = last - first >= FULL_CIRCLE
+        is_closed = way is None and last - first >= FULL_CIRCLE
         share = time if is_closed else 0.5 - 0.5 * math.cos(FULL_CIRCLE * time)  # slows down where it turns
-        position, forward = _place(path, first + share * (last - first), begin)
+        position, forward = way(share) if way else _place(path, first + share * (last - first), begin)
         rotation = _look_along(forward, path.up)
         camera = Camera(
             rotation, -rotation @ position, path.focal, path.focal, 0.5 * width, 0.5 * height, width, height
@@ -132,6 +135,11 @@ def _smooth(path: _Path, angle: float) -> tuple[Floats, Floats]:
     weights = np.exp(exponents - exponents.max())  # [V]
     weights /= weights.sum()
     return weights @ path.places, weights @ path.directions
+
+
+def _off_circle(path: _Path) -> Floats:
+    """Return how much farther from the axis the cameras are than the path at their angles [V]."""
+    return path.places[:, 0] - np.array([_smooth(path, float(angle))[0][0] for angle in path.angles])
 
 
 def _place(path: _Path, angle: float, begin: _Step | None) -> tuple[Floats, Floats]:

@@ -38,6 +38,7 @@ from minisplat_ref.io.names import is_file, with_any_suffix
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
 
+TEST_EVERY = 8  # of the photographs one is a test view where nothing else is asked for, as in the 3DGS code
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 COORDINATE_MAX = 1e18  # world units or pixels; the square of more would overflow float32
 DARK = 64  # of 255: a scene whose brightest pixel is below is stored in the wrong range; 14 bits of 16 reach 63

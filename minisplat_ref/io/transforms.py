@@ -31,7 +31,7 @@ from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.lens import PARALLEL_MODEL, PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
 from minisplat_ref.io.names import is_file, nearby_path, spelled_on_disk
 from minisplat_ref.io.ply import NO_POINTS, load_points
-from minisplat_ref.io.scene import Listing, Photo, build_reading, build_scene, make_listing, split_photos
+from minisplat_ref.io.scene import TEST_EVERY, Listing, Photo, build_reading, build_scene, make_listing, split_photos
 from minisplat_ref.types import Camera, Floats, Scene
 
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
@@ -50,7 +50,7 @@ def load_transforms(
     path: str | Path,
     *,
     downscale: int = 1,
-    test_every: int = 8,
+    test_every: int = TEST_EVERY,
     background: Sequence[float] | Floats | None = None,
     undistort: bool = False,
     as_photographed: bool = False,

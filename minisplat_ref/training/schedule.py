@@ -16,7 +16,7 @@ from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import CALIBRATIONS, NONE, Calibration
 from minisplat_ref.training.dropout import OPEN_LENGTH, drop_share
-from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.losses import LossTerm, photometric, photometric_of_part
 from minisplat_ref.training.pace import Cooling, Pace
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import GAUSSIANS, Representation
@@ -90,6 +90,10 @@ class Every(NamedTuple):
     def scale(self, factor: Fraction) -> "Every":
         """Return the event for a run of ``factor`` times the length."""
         return self._replace(factor=self.factor * factor)
+
+    def as_often(self, factor: Fraction) -> "Every":
+        """Return the event with a gap that leaves as many actions in ``factor`` times the iterations."""
+        return self._replace(min_gap=max(1, _scale_step(self.min_gap, factor)))
 
 
 class At(NamedTuple):
@@ -266,17 +270,44 @@ def scale_recipe(recipe: Recipe, iterations: int) -> Recipe:
         raised = shortening**calibration.short_run_exponent
         return calibration._replace(rates=calibration.rates.scale(factor, raised, raised))
 
+    return _move_milestones(recipe, iterations, raised)._replace(
+        calibrations=tuple(map(scale_calibration, recipe.calibrations)),
+        representation=recipe.representation._replace(
+            rates=recipe.representation.rates.scale(factor, raised, raised**2)
+        ),
+    )
+
+
+def compress_recipe(recipe: Recipe, iterations: int) -> Recipe:
+    """Return the recipe for a part of the scene that a share of the photographs shows, in that share of the iterations.
+
+    A Gaussian of the part is as often in a photograph as in the recipe's own iterations, so learning rates stay, and
+    periodic events stay as many. Photographs count by the part of their pixels that shows it.
+    """
+    factor = Fraction(iterations, recipe.iterations)
+    as_often = (event.as_often(factor) if isinstance(event, Every) else event for event in recipe.events)
+    of_part = recipe._replace(losses=tuple(map(_weigh_by_part, recipe.losses)), events=tuple(as_often))
+    return _move_milestones(of_part, iterations, raised=1.0)
+
+
+def _move_milestones(recipe: Recipe, iterations: int, raised: float) -> Recipe:
+    """Return the recipe for another number of iterations, with rates ``raised`` times as high."""
+    factor = Fraction(iterations, recipe.iterations)
     return recipe._replace(
         iterations=iterations,
         learning_rates=recipe.learning_rates.scale(factor, raised, raised**2),
         sh_milestones=tuple(_scale_step(milestone, factor) for milestone in recipe.sh_milestones),
         losses=tuple(term.scale(factor) for term in recipe.losses),
         events=tuple(event.scale(factor) for event in recipe.events),
-        calibrations=tuple(map(scale_calibration, recipe.calibrations)),
-        representation=recipe.representation._replace(
-            rates=recipe.representation.rates.scale(factor, raised, raised**2)
-        ),
     )
+
+
+def _weigh_by_part(term: LossTerm) -> LossTerm:
+    """Return the term for parts of photographs, if it is the photometric one; others have no mean over pixels."""
+    function = term.function
+    if not (isinstance(function, partial) and function.func is photometric):
+        return term
+    return term._replace(function=partial(photometric_of_part, **function.keywords))
 
 
 def _scale_step(step: int, factor: Fraction) -> int:

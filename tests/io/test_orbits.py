@@ -90,6 +90,66 @@ def test_cameras_side_by_side():
 # films
 
 
+def street(n, seed=0, turn=0.0):
+    """Cameras of a walk of n steps of about 1.5 along z, at eye level, which sways and looks ahead.
+
+    After half of it the street turns by so many degrees.
+    """
+    rng = np.random.default_rng(seed)
+    views, position, heading = [], np.zeros(3), 0.0
+    for k in range(n):
+        heading = math.radians(turn) if k >= n // 2 else 0.0
+        position = position + rng.uniform(1.2, 1.8) * np.array([math.sin(heading), 0.0, math.cos(heading)])
+        x, yaw = position + rng.normal(0, 0.1, 3), heading + rng.normal(0, 0.05)
+        rotation = np.array(
+            [[math.cos(yaw), 0.0, -math.sin(yaw)], [0.0, 1.0, 0.0], [math.sin(yaw), 0.0, math.cos(yaw)]]
+        )
+        camera = make_camera(width=WIDTH, height=HEIGHT)._replace(
+            cam_from_world_R=rotation, cam_from_world_t=-rotation @ x
+        )
+        views.append(Viewpoint(f"{k:03d}", camera, "train"))
+    return views
+
+
+def distances_to(frames, views):
+    """Distance of each frame to the nearest segment between photographs that follow each other."""
+    centres = np.array([view.camera.center for view in views])
+    a, d = centres[:-1], np.diff(centres, axis=0)
+    points = np.array([frame.camera.center for frame in frames])[:, None]
+    t = np.clip(((points - a) * d).sum(axis=2) / (d**2).sum(axis=1), 0, 1)
+    return np.linalg.norm(points - a - t[:, :, None] * d, axis=2).min(axis=1)
+
+
+@pytest.mark.parametrize("turn", [0.0, 90.0])
+def test_a_walk_stays_in_its_street(turn):
+    views = street(25, turn=turn)
+    frames = orbit(NOTHING, views, 60, WIDTH, HEIGHT)
+    assert distances_to(frames, views).max() < 0.3, "swaying is 0.1, a step 1.5"
+    np.testing.assert_allclose(frames[0].camera.center, views[0].camera.center, rtol=0, atol=CLOSED_FORM)
+    np.testing.assert_allclose(frames[30].camera.center, views[-1].camera.center, rtol=0, atol=CLOSED_FORM)
+    ahead = np.array([frame.camera.cam_from_world_R[2] for frame in frames])
+    assert (ahead[:10, 2] > 0.95).all() and np.abs(ahead[:, 1]).max() < 0.2, "it looks where the walker looked"
+    steps = np.linalg.norm(np.diff([frame.camera.center for frame in frames], axis=0), axis=1)
+    assert steps.max() < 1.5 * math.pi / 2 * steps.mean(), "no jump"
+
+
+def test_only_a_walk_is_walked():
+    """Cameras around a scene, beside a wall, and in no order, are followed on a circle as before; so is an arc."""
+    ring = ring_of_cameras(TARGET, radius=2.0, height=0.7, n=36)
+    wall = [view._replace(camera=sideways(view.camera)) for view in street(25)]
+    shuffled = [street(25)[k] for k in np.random.default_rng(1).permutation(25)]
+    for views in (ring, wall, shuffled):
+        assert orbit(NOTHING, views, 8, WIDTH, HEIGHT)[4].camera.center != pytest.approx(views[-1].camera.center)
+    views = street(25)
+    assert distances_to(orbit(NOTHING, views, 60, WIDTH, HEIGHT, math.radians(90)), views).max() > 1
+
+
+def sideways(camera):
+    """The camera, turned by 90 degrees about its vertical axis in its place."""
+    rotation = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]) @ camera.cam_from_world_R
+    return camera._replace(cam_from_world_R=rotation, cam_from_world_t=-rotation @ camera.center)
+
+
 @pytest.fixture
 def images(tmp_path):
     paths = [tmp_path / f"{k}.png" for k in range(3)]

@@ -23,6 +23,7 @@ from minisplat_ref.app.blocks.coverage import Coarse, cover
 from minisplat_ref.app.blocks.grid import Block, divide, ground_plane
 from minisplat_ref.app.listing_file import select
 from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs.continued_part import find_beginning
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.scene_part import Part, Plane, Region, box_from_json
 from minisplat_ref.app.runs.scoring import choose_render_settings
@@ -36,6 +37,7 @@ COARSE = "coarse"
 COARSE_RECIPE = "3dgs-accel"  # every recipe can start from its Gaussians
 COARSE_PART = 4  # a quarter of the iterations of a training of the whole
 COARSE_ITERATIONS = 1000  # for recipes that decide their own length
+CONTINUED = frozenset({"3dgs", COARSE_RECIPE})  # no step of theirs is for the scene as a whole
 PIXEL_BYTES = 4  # of a photograph, three, and of its mask
 TRAINED_COPIES = 4  # parameters, gradients, two moments
 FRESH: dict[str, Any] = {"extension": None, "set": {}, "simplify": None, "scene_type": None}
@@ -60,9 +62,17 @@ class BlockTraining(NamedTuple):
         return self.blocks_folder / name
 
     @property
+    def is_continued(self) -> bool:
+        """Whether the coarse training is the beginning of that of the whole, and each block continues it."""
+        return self.settings.recipe in CONTINUED and self.settings.extension is None
+
+    @property
     def coarse(self) -> Settings:
         """Settings of the coarse training."""
         whole = self.settings.iterations
+        if self.is_continued:
+            n = max(1, whole // COARSE_PART)
+            return replace(self.settings, iterations=n, schedule_iterations=n, whole_iterations=whole)
         n = COARSE_ITERATIONS if configure_recipe(self.settings).cooling is not None else whole // COARSE_PART
         n = max(1, min(n, whole))
         return replace(self.settings, recipe=COARSE_RECIPE, iterations=n, schedule_iterations=n, **FRESH)
@@ -74,7 +84,9 @@ class Planned(NamedTuple):
     block: Block
     n_photographs: int
     iterations: int
-    """Of its training."""
+    """Of its schedule."""
+    n_done: int
+    """The part of these that the coarse training has done."""
     megabytes: int
     """Of its photographs with their masks, and of its first Gaussians while they are trained; the process itself, and
     Gaussians that are added, come on top."""
@@ -94,6 +106,7 @@ class Plan(NamedTuple):
             training.settings,
             iterations=planned.iterations,
             schedule_iterations=planned.iterations,
+            whole_iterations=training.settings.iterations if training.is_continued else None,
             init=str(training.run_folder_for(COARSE).resolve()),
             block=str((training.blocks_folder / f"{planned.block.name}.json").resolve()),
         )
@@ -151,7 +164,8 @@ def make_plan(training: BlockTraining, listing: Listing, scene: Scene, coarse: C
     blocks = divide(plane.coordinates(centers), training.shape)
     masks, trained = cover(coarse, scene, plane, blocks)
     for block, own in zip(blocks, masks, strict=True):
-        part = Part(Region(plane, block.region), select(listing, own.keys()), own)
+        extent = scene.extent * scene.frame.unit if training.is_continued else None
+        part = Part(Region(plane, block.region), select(listing, own.keys()), own, extent)
         part.write(training.blocks_folder / f"{block.name}.json")
     n_views, cooling = len(scene.train_views), configure_recipe(training.settings).cooling
     whole = training.settings.iterations
@@ -163,7 +177,8 @@ def make_plan(training: BlockTraining, listing: Listing, scene: Scene, coarse: C
         n_bytes = PIXEL_BYTES * sum(mask.size for mask in own.values())
         share = np.count_nonzero(block.region.contains(places)) / len(places)
         n_bytes += round(share * TRAINED_COPIES * sum(field.nbytes for field in gaussians))
-        planned.append(Planned(block, len(own), n_iterations, math.ceil(n_bytes / 1e6)))
+        n_done = find_beginning(n_iterations, whole, training.coarse.iterations) if training.is_continued else 0
+        planned.append(Planned(block, len(own), n_iterations, n_done, math.ceil(n_bytes / 1e6)))
     return Plan(plane, tuple(planned), trained)
 
 
@@ -202,7 +217,7 @@ def to_json(training: BlockTraining, plan: Plan) -> dict[str, Any]:
         "origin": plan.plane.origin.tolist(),
         "axes": plan.plane.axes.tolist(),
         "coarse_iterations": training.coarse.iterations,
-        "iterations": training.coarse.iterations + sum(planned.iterations for planned in plan.blocks),
+        "iterations": count_iterations(training, plan),
         "trained_pixels": plan.trained,
         "blocks": [
             {
@@ -212,6 +227,7 @@ def to_json(training: BlockTraining, plan: Plan) -> dict[str, Any]:
                 "cameras": planned.block.n_cameras,
                 "photographs": planned.n_photographs,
                 "iterations": planned.iterations,
+                "done_by_coarse": planned.n_done,
                 "megabytes": planned.megabytes,
             }
             for planned in plan.blocks
@@ -243,16 +259,22 @@ def load_plan(folder: Path) -> Plan | None:
 def _planned(entry: dict[str, Any]) -> Planned:
     core, region = box_from_json(entry["core"]), box_from_json(entry["region"])
     block = Block(str(entry["name"]), core, region, int(entry["cameras"]))
-    return Planned(block, int(entry["photographs"]), int(entry["iterations"]), int(entry["megabytes"]))
+    numbers = (int(entry[key]) for key in ("photographs", "iterations", "done_by_coarse", "megabytes"))
+    return Planned(block, *numbers)
+
+
+def count_iterations(training: BlockTraining, plan: Plan) -> int:
+    """Return the iterations of all trainings together."""
+    return training.coarse.iterations + sum(planned.iterations - planned.n_done for planned in plan.blocks)
 
 
 def describe(training: BlockTraining, plan: Plan) -> str:
     """Return the plan in a line."""
     numbers = [planned.n_photographs for planned in plan.blocks]
-    total = training.coarse.iterations + sum(planned.iterations for planned in plan.blocks)
+    n_iterations = count_iterations(training, plan)
     return (
-        f"{len(numbers)} blocks of {_range(numbers)} photographs, {total:,} iterations in all; {plan.trained:.0%} of"
-        f" the pixels are trained on; see {training.folder / run_folder.BLOCK_PLAN}"
+        f"{len(numbers)} blocks of {_range(numbers)} photographs, {n_iterations:,} iterations in all;"
+        f" {plan.trained:.0%} of the pixels are trained on; see {training.folder / run_folder.BLOCK_PLAN}"
     )
 
 

@@ -23,7 +23,6 @@ from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.scene import Listing
 from minisplat_ref.io.stored_views import Pixels, StoredView
 from minisplat_ref.strategy.ops import contiguous, take
-from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Bools, Floats, Scene, View
 
@@ -66,13 +65,20 @@ class Region(NamedTuple):
     plane: Plane
     box: Box
 
-    def crop(self, state: TrainState) -> TrainState:
-        """Keep of a state before its first iteration the Gaussians of the region."""
+    def find_rows(self, state: TrainState) -> Bools:
+        """Return [N]: which Gaussians of a state lie in the region."""
         means = return_points(state.gaussians.means, state.frame)
-        rows = self.box.contains(self.plane.coordinates(means))
-        state.gaussians = contiguous(take(state.gaussians, rows))
-        state.adam = zero_moments(state.gaussians)
-        return state
+        return self.box.contains(self.plane.coordinates(means))
+
+
+def keep_rows(state: TrainState, rows: Bools) -> TrainState:
+    """Keep Gaussians [N] of a state, with their moments and statistics."""
+    state.gaussians, first, second = (
+        contiguous(take(fields, rows)) for fields in (state.gaussians, state.adam.first, state.adam.second)
+    )
+    state.adam = state.adam._replace(first=first, second=second)
+    state.stats = {name: np.ascontiguousarray(values[rows]) for name, values in state.stats.items()}
+    return state
 
 
 class Part(NamedTuple):
@@ -84,6 +90,9 @@ class Part(NamedTuple):
     """Of its photographs, all for training, and of the points that they show."""
     masks: Mapping[str, Bools]
     """[H, W] by the name of the photograph: True where it shows the region, or nothing at all."""
+    extent: float | None = None
+    """That of the whole scene, in the unit of the files, for a part that continues a training of the whole; None for
+    one that has an extent of its own."""
 
     def write(self, path: Path) -> None:
         """Write both files; ``path`` is that of the JSON, which comes last."""
@@ -94,20 +103,22 @@ class Part(NamedTuple):
             "origin": self.region.plane.origin.tolist(),
             "axes": self.region.plane.axes.tolist(),
             "region": self.region.box.to_json(),
+            "extent": self.extent,
             "masks": [[name, *mask.shape] for name, mask in self.masks.items()],
             **listing_file.to_json(self.listing),
         }
         write_json(path, content)
 
     def hide(self, scene: Scene) -> Scene:
-        """Return the scene that was built of the listing, with masks.
+        """Return the scene that was built of the listing, with masks, and with the extent of the whole if it has that.
 
         Raises
         ------
         InputError
             A photograph has another size than its mask.
         """
-        return scene._replace(train_views=tuple(self._masked(view) for view in scene.train_views))
+        scene = scene._replace(train_views=tuple(self._masked(view) for view in scene.train_views))
+        return scene if self.extent is None else scene._replace(extent=self.extent)
 
     def _masked(self, view: View) -> View:
         mask = self.masks[view.name]
@@ -143,7 +154,9 @@ def read_part(path: Path, source: Path) -> Part:
     region, content = read_region(path), read_json_object(path)
     try:
         arrays = read_npz(path.with_suffix(".npz"), WAY_OUT)
-        return Part(region, listing_file.read_listing(source, content, arrays), _unpack(content["masks"], arrays))
+        listing, masks = listing_file.read_listing(source, content, arrays), _unpack(content["masks"], arrays)
+        extent = content["extent"]
+        return Part(region, listing, masks, None if extent is None else float(extent))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _version_error(path, error) from error
 

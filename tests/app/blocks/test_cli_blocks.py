@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,18 @@ import pytest
 from minisplat_ref.app.blocks import train as train_module
 from minisplat_ref.app.blocks.plan import load_block_training, load_plan, too_large
 from minisplat_ref.app.cli import main, train_blocks
-from minisplat_ref.app.runs import cluster
+from minisplat_ref.app.runs import checkpoints, cluster, continued_part
+from minisplat_ref.app.runs.continued_part import continue_part, find_beginning
+from minisplat_ref.app.runs.scene_part import read_region
+from minisplat_ref.app.runs.settings import configure_recipe, load, load_photographs
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io import load_ply
+from minisplat_ref.reference.compositing import composite_all_pairs
+from minisplat_ref.rendering.backends import REFERENCE
+from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.training.pace import Pace
 from run_commands import contents, read_json, refused, write_room  # noqa: F401  (a fixture)
+from scenes import activated, as_dtype
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 120, "test_every": 4}
 OPTIONS = ["--recipe", "3dgs-accel", "--iterations", "16", "--test-every", "4", "--seed", "3"]
@@ -55,11 +65,12 @@ def test_the_folder_is_a_run_with_its_plan(finished, capsys):
     assert plan["grid"] == [2, 1] and plan["coarse_iterations"] == 4
     assert [block["name"] for block in plan["blocks"]] == ["0-0", "1-0"]
     assert sum(block["cameras"] for block in plan["blocks"]) == 8
-    for block in plan["blocks"]:  # of 16 iterations of 8 photographs
+    for block in plan["blocks"]:  # of 16 iterations of 8 photographs, a quarter of which the coarse training has done
         assert block["iterations"] == 2 * block["photographs"]
+        assert block["done_by_coarse"] == round(block["photographs"] / 2)
         run = read_json(finished / "blocks" / block["name"] / "metrics.json")
         assert run["iterations"] == block["iterations"]
-    assert plan["iterations"] == 4 + sum(block["iterations"] for block in plan["blocks"])
+    assert plan["iterations"] == 4 + sum(block["iterations"] - block["done_by_coarse"] for block in plan["blocks"])
     metrics = read_json(finished / "metrics.json")
     assert metrics["iterations"] == 16 and len(metrics["per_view"]) == 3
     assert metrics["train_seconds"] > 0
@@ -82,16 +93,74 @@ def test_the_whole_is_of_the_cores(finished):
     np.testing.assert_array_equal(load_ply(finished / "point_cloud.ply").means, np.concatenate(parts))
 
 
+def find_first_rows(plan, planned, coarse, scene, least):
+    """The coarse model's Gaussians of the region, and those that fill so many pixels of the part by the reference."""
+    inside, n = planned.block.region.contains(plan.plane.coordinates(coarse.gaussians.means)), n_rows(coarse.gaussians)
+    weights = np.zeros(n)
+    for view in scene.train_views:
+        splats = REFERENCE.project(*activated(as_dtype(coarse.gaussians, np.float64)), view.camera, GSPLAT_MAIN)
+        size = view.camera.width, view.camera.height
+        weights += composite_all_pairs(splats, np.eye(n), np.zeros(n), *size, GSPLAT_MAIN)[0][view.mask].sum(axis=0)
+    assert (np.abs(weights - least) > 1e-3).all()  # float32 decides as float64 does
+    return inside, weights > least
+
+
 def test_blocks_start_from_the_coarse_model_in_their_regions(finished):
     training, plan = load_block_training(finished), load_plan(finished)
-    coarse = load_ply(finished / "blocks" / "coarse" / "point_cloud.ply").means
+    folder = finished / "blocks" / "coarse"
+    coarse = checkpoints.load(folder, load(folder))
     for planned in plan.blocks:
         settings = read_json(finished / "blocks" / planned.block.name / "config.json")["settings"]
         assert settings["init"] == str(finished / "blocks" / "coarse")
         (first, *_) = (finished / "blocks" / planned.block.name / "log.jsonl").read_text().splitlines()
-        expected = planned.block.region.contains(plan.plane.coordinates(coarse)).sum()
-        assert json.loads(first)["n_gaussians"] == expected < len(coarse)
+        scene = load_photographs(load(finished / "blocks" / planned.block.name))
+        inside, needed = find_first_rows(plan, planned, coarse, scene, 1.0)
+        assert json.loads(first)["n_gaussians"] == (inside | needed).sum() > inside.sum()
     assert training.shape == (2, 1)
+
+
+def test_blocks_continue_the_coarse_training(finished, monkeypatch):
+    """Gaussians, moments and statistics are those of its end; rates and dates are those of the whole at that time."""
+    training, plan = load_block_training(finished), load_plan(finished)
+    coarse = checkpoints.load(training.run_folder_for("coarse"), load(training.run_folder_for("coarse")))
+    assert (coarse.step, coarse.adam.step) == (4, 4) and coarse.adam.second.means.any() and coarse.stats
+    monkeypatch.setattr(continued_part, "WEIGHT_MIN", 20.0)  # all fill a pixel of these small photographs
+    whole = configure_recipe(training.settings)
+    for planned in plan.blocks:
+        settings = load(training.run_folder_for(planned.block.name))
+        scene = load_photographs(settings)
+        state = continue_part(settings, read_region(Path(settings.block)), scene)
+        inside, needed = find_first_rows(plan, planned, coarse, scene, 20.0)
+        assert (inside & ~needed).any() and (needed & ~inside).any()
+        rows = inside | needed
+        assert not rows.all()
+        assert (state.step, state.adam.step, state.view_order) == (planned.n_done, 4, [])
+        for ours, theirs in (
+            (state.gaussians, coarse.gaussians),
+            (state.adam.first, coarse.adam.first),
+            (state.adam.second, coarse.adam.second),
+            (state.stats.values(), coarse.stats.values()),
+        ):
+            for field, of_coarse in zip(ours, theirs, strict=True):
+                np.testing.assert_array_equal(field, of_coarse[rows])
+        part = configure_recipe(settings)
+        assert scene.extent == load_photographs(training.settings).extent
+        assert part.iterations == planned.iterations
+        for of_part, of_whole in ((planned.n_done, 4), (planned.iterations, 16)):
+            ours, theirs = part.rates_at(of_part, scene.extent, Pace()), whole.rates_at(of_whole, scene.extent, Pace())
+            assert ours == pytest.approx(theirs, rel=0.2)  # dates are rounded to one iteration of seven
+
+
+def test_a_part_needs_the_run_that_it_continues(scene_folder, finished, tmp_path, refused):
+    part = ["--block", finished / "blocks" / "0-0.json", "--whole-iterations", "16"]
+    line = refused("train", scene_folder, *OPTIONS, *part, "--out", tmp_path / "out")
+    assert "needs its run: give --init" in line
+
+
+@pytest.mark.parametrize(("n", "n_done", "expected"), [(14, 4, 4), (1200, 600, 300), (1, 4, 0), (3, 16, 2)])
+def test_beginning_of_a_part(n, n_done, expected):
+    """A quarter of 14 is 3.5, and one iteration at least is left."""
+    assert find_beginning(n, 16 if n < 100 else 2400, n_done) == expected
 
 
 def test_a_block_reads_nothing_of_the_model(scene_folder, finished, tmp_path, monkeypatch):

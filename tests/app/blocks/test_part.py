@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minisplat_ref.app.runs.scene_part import Box, Part, Plane, Region, read_part, read_region
+from minisplat_ref.app.runs.scene_part import Box, Part, Plane, Region, keep_rows, read_part, read_region
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import Listing, Photo
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
@@ -42,7 +42,10 @@ def test_files_give_it_back(part, tmp_path):
     np.testing.assert_array_equal(again.masks["a/1"], ~MASK)
 
 
-PLACED = '{"origin": [0, 0, 0], "axes": [[1, 0, 0], [0, 1, 0]], "region": [[0, 0], [1, 1]], "alpha_is_mask": true, '
+PLACED = (
+    '{"origin": [0, 0, 0], "axes": [[1, 0, 0], [0, 1, 0]], "region": [[0, 0], [1, 1]], "extent": null,'
+    ' "alpha_is_mask": true, '
+)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +76,13 @@ def test_masks_are_those_of_the_photographs_and_of_the_part(part):
     assert isinstance(hidden.train_views[1], StoredView)
 
 
+def test_a_part_that_continues_has_the_extent_of_the_whole(part, tmp_path):
+    view = View("b", CAMERA, IMAGE, None)
+    assert part.hide(scene_of(view)).extent == 1.0
+    part._replace(extent=7.5).write(tmp_path / "0-0.json")
+    assert read_part(tmp_path / "0-0.json", Path("s")).hide(scene_of(view)).extent == 7.5
+
+
 def test_photographs_of_another_size_are_refused(part):
     with pytest.raises(InputError, match="photograph b is 4x2 and was 3x2 when the blocks were planned"):
         part.hide(scene_of(View("b", make_camera(4, 2), IMAGE, None)))
@@ -84,6 +94,8 @@ def test_first_gaussians_are_those_of_the_region(part):
     population = balls(means, [0.1] * 5, [0.5] * 5, [[0.1, 0.2, 0.3]] * 5)
     state = TrainState(population, zero_moments(population), 0, [], np.random.default_rng(0), {})
     state.frame = Frame((1.0, 0.0, 0.0), 2.0)
-    cropped = part.region.crop(state)
+    state.adam.first.means[:, 0], state.stats["seen"] = range(5), np.arange(5)
+    cropped = keep_rows(state, part.region.find_rows(state))
     assert cropped.gaussians.means[:, 0].tolist() == [0.9, -50.0]
-    assert len(cropped.adam.first.means) == 2
+    assert cropped.adam.first.means[:, 0].tolist() == cropped.stats["seen"].tolist() == [0, 3]
+    assert len(cropped.adam.second.means) == 2
