@@ -1,20 +1,22 @@
 """Measure what ``sfm`` makes of folders of photographs: cameras, points and time, as docs/measured/sfm.md reports.
 
-``python -m data_tools.measure_sfm PHOTOS...`` prints a table. Where a COLMAP model of the same photographs lies beside
-the folder (``../sparse/0``), the camera centres are compared with it. Processor seconds are those of all threads, so
-that other work on the machine matters little.
+``python -m data_tools.measure_sfm PHOTOS...`` prints two tables: the results, and the parts of the work with their
+times. Where a COLMAP model of the same photographs lies beside the folder (``../sparse/0``), the camera centres are
+compared with it. Processor seconds are those of all threads, so that other work on the machine matters little.
 """
 
 import argparse
 import shutil
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from minisplat_ref.app.cli.sfm import FEATURES
+from minisplat_ref.app.cli.sfm import FEATURES, MATCHINGS
 from minisplat_ref.datasets.sfm import run_sfm
+from minisplat_ref.datasets.sfm.attempts import Part
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io.colmap import find_model, read_model
 from minisplat_ref.io.lens import import_quiet_pycolmap
@@ -30,13 +32,14 @@ HEADING = (
     "centres off by",
     "processor s",
 )
+PARTS_HEADING = ("photographs", "part", "photographs or pairs", "processor s", "each")
 
 
-def measure(photos: Path, features: str, work: Path) -> list[list[str]]:
-    """Make a scene; return a row of the table for each result, the one that was kept first."""
+def measure(photos: Path, features: str, matching: str | None, work: Path) -> tuple[list[list[str]], list[list[str]]]:
+    """Make a scene; return a row for each result, the one that was kept first, and a row for each part of the work."""
     scene = work / "scene"
     start = time.process_time()
-    result = run_sfm(photos, scene, features=features)
+    result = run_sfm(photos, scene, features=features, matching=matching)
     seconds = time.process_time() - start
     error = f"{center_error(scene, photos.parent):.2%}" if find_model(photos.parent) is not None else ""
     rows = [
@@ -54,6 +57,13 @@ def measure(photos: Path, features: str, work: Path) -> list[list[str]]:
     ]
     rows[0][0], rows[0][6:] = f"**{photos.parent.name}**", [error, f"{seconds:.0f}"]
     shutil.rmtree(scene)
+    return rows, describe_parts(photos.parent.name, result.parts)
+
+
+def describe_parts(name: str, parts: Sequence[Part]) -> list[list[str]]:
+    """Return a row for each part of the work; the first one has the name of the photographs."""
+    rows = [["", part.name, f"{part.n:,}", f"{part.seconds:.1f}", f"{part.seconds / part.n:.2f}"] for part in parts]
+    rows[0][0] = f"**{name}**"
     return rows
 
 
@@ -78,10 +88,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path, nargs="+", metavar="PHOTOS", help="folders of photographs")
     parser.add_argument("--features", choices=FEATURES, default=FEATURES[0], metavar="F", help="default: auto")
+    parser.add_argument("--matching", choices=MATCHINGS, default=MATCHINGS[0], metavar="M", help="default: auto")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
-        rows = [row for photos in args.photos for row in measure(photos, args.features, Path(work))]
-    print(f"\n{describe_machine()}\n\n{markdown_table(HEADING, rows, is_aligned=False)}")
+        measured = [measure(photos, args.features, args.matching, Path(work)) for photos in args.photos]
+    results, parts = ([row for rows in part for row in rows] for part in zip(*measured, strict=True))
+    print("", describe_machine(), sep="\n")
+    for heading, rows in ((HEADING, results), (PARTS_HEADING, parts)):
+        print("", markdown_table(heading, rows, is_aligned=False), sep="\n")
 
 
 if __name__ == "__main__":

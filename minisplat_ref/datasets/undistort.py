@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.io.colmap import colmap_photos, find_model, image_folder, read_model, write_model
+from minisplat_ref.io.colmap import colmap_photos, find_model, image_folder, write_model
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
@@ -58,7 +58,7 @@ def undistort_scene(scene: Path, out: Path) -> None:
         raise InputError(f"{scene}: neither a COLMAP model nor a transforms.json; give the folder of a scene")
     with making_folder(out) as folder:
         if model is not None:
-            photos = colmap_photos(scene, read_model(scene))
+            photos = colmap_photos(scene)
             _check_distorted(scene, photos)
             for photo in with_progress(photos, "reading", "photographs"):
                 check_pixels(photo)  # COLMAP fills what is missing of a truncated file with gray
@@ -110,7 +110,7 @@ def undistort_colmap(scene: Path, photos: Sequence[Photo], out: Path) -> list[Ph
                 _write(out / "images" / photo.file, view.image)
             if view.mask is not None:
                 _write(out / "masks" / f"{photo.file}.png", view.mask)
-    written = colmap_photos(out, read_model(out))
+    written = colmap_photos(out)
     missing = sorted({photo.file for photo in photos} - {photo.file for photo in written})
     if missing:
         raise InputError(f"{scene}: COLMAP has not undistorted {', '.join(missing)}; export the model again")

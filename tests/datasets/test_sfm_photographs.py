@@ -6,7 +6,7 @@ from PIL import ExifTags, Image
 
 from minisplat_ref.datasets.photo_files import list_images
 from minisplat_ref.datasets.sfm.level import upright_by_sensor
-from minisplat_ref.datasets.sfm.photographs import Group, find_mask, prepare_photos
+from minisplat_ref.datasets.sfm.photographs import Group, find_mask, order, prepare_photos
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io.images import read_image, read_mask, write_image
 from minisplat_ref.io.lens import import_pycolmap
@@ -33,6 +33,28 @@ def save(path, image, *, orientation=None, focal=None, focal_35=None, model=None
     lens.update({ExifTags.Base.FocalLengthIn35mmFilm: focal_35} if focal_35 is not None else {})
     exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitudeRef] = "N"
     Image.fromarray(image).save(path, exif=exif, **options)
+
+
+# their order
+
+
+def test_photographs_are_in_the_order_of_their_times():
+    times = {"b.jpg": "2026:01:02 10:00:00.5", "a.jpg": "2026:01:02 10:00:00.51", "c.jpg": "2025:12:31 23:59:59."}
+    assert order(times) == ["c.jpg", "b.jpg", "a.jpg"]
+    assert order({**times, "d.jpg": ""}) == ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]  # as long as one has none
+    assert order(dict.fromkeys("ba", "2026:01:02 10:00:00.")) == ["a", "b"]
+
+
+def test_times_are_read_from_exif_data_and_left_out_of_the_copies(photos, tmp_path):
+    for name, time in (("a.jpg", "2026:01:02 10:00:01"), ("b.jpg", "2026:01:02 10:00:00")):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DateTimeOriginal] = time
+        Image.fromarray(colored_image(1)).save(photos / name, exif=exif)
+    found = prepare_photos(photos, tmp_path / "work", 40)
+    assert found.ordered == ["b.jpg", "a.jpg"] and list(found.originals) == ["a.jpg", "b.jpg"]
+    assert b"10:00:01" not in (found.images / "a.jpg").read_bytes()
+    save(photos / "c.jpg", colored_image(2))
+    assert prepare_photos(photos, tmp_path / "again", 40).ordered == ["a.jpg", "b.jpg", "c.jpg"]
 
 
 # which files count

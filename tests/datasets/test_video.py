@@ -64,7 +64,7 @@ def test_the_frames_that_are_left_at_the_end_count_too(clip, tmp_path):
 
 
 def test_a_video_is_matched_with_neighbours(clip, tmp_path):
-    assert default_matching(clip) == "sequential" and default_matching(tmp_path) == "exhaustive"
+    assert default_matching(clip) == "sequential" and default_matching(tmp_path) == "auto"
     assert is_video(clip) and not is_video(tmp_path) and not is_video(tmp_path / "no.mp4")
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 LONG_SIDE = 1600  # pixels
 FEATURES = ("auto", "standard", "dense")
-MATCHINGS = ("exhaustive", "sequential")
+MATCHINGS = ("auto", "exhaustive", "sequential")
 CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 DESCRIPTION = """\
@@ -57,13 +57,14 @@ def add_parser(commands: Commands) -> None:
         default=FEATURES[0],
         metavar="F",
         help="standard; dense: more of them, matched more thoroughly, in about ten times the time; or auto (default):"
-        " also dense if standard ones leave photographs without a place or give few points",
+        " also dense if standard ones leave photographs without a place",
     )
     parser.add_argument(
         "--matching",
         choices=MATCHINGS,
         metavar="M",
-        help="exhaustive: every pair (default), or sequential: neighbours (default of a video)",
+        help="exhaustive: every pair; sequential: neighbours in time (default of a video); or auto (default):"
+        " neighbours, and every pair of few photographs, or if neighbours leave some without a place",
     )
     parser.add_argument(
         "--every",

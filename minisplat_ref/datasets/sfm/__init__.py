@@ -12,21 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from minisplat_ref.datasets.sfm.features import (
-    DENSE,
-    STANDARD,
-    Features,
-    Pair,
-    find_features,
-    match_features,
-    overlapping_pairs,
-    pairs_to_match,
-)
-from minisplat_ref.datasets.sfm.judging import Matches, choose, read_matches
+from minisplat_ref.datasets.sfm.attempts import Part, reconstruct
 from minisplat_ref.datasets.sfm.level import record_up
-from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
-from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
-from minisplat_ref.datasets.sfm.zoom import copy_database, own_groups, split_groups
+from minisplat_ref.datasets.sfm.mapping import Mapped
+from minisplat_ref.datasets.sfm.photographs import Group, prepare_photos
 from minisplat_ref.datasets.undistort import undistort_colmap
 from minisplat_ref.datasets.video import is_video, keep_sharpest
 from minisplat_ref.errors import InputError
@@ -35,9 +24,6 @@ from minisplat_ref.io.colmap import colmap_photos
 from minisplat_ref.io.upright import Up
 
 PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
-ROUNDS = 2  # in which photographs are told apart by their focal lengths, the second one with right cameras
-ZOOM_SHARE = 0.5  # of the photographs, ours; with fewer placed, one camera for all of a size may be why
-POINTS_MIN = 150  # for each photograph; with fewer, dense features are tried
 
 
 class SfmResult(NamedTuple):
@@ -54,7 +40,7 @@ class SfmResult(NamedTuple):
     kept: Mapped
     """The result that was kept, without its model."""
     others: tuple[Mapped, ...]
-    """The other results, without their models: of the other mapper, and of other features if they were tried."""
+    """The other results, without their models: of the other mapper and of other features, if they were tried."""
     n_matches: int
     """Verified matches, with which the results were judged."""
     groups: Mapping[Group, list[str]]
@@ -65,11 +51,13 @@ class SfmResult(NamedTuple):
     """Width and height of each photograph in the scene, pixels."""
     up: Up
     """What is up."""
+    parts: tuple[Part, ...] = ()
+    """The parts of the work, with their processor times."""
 
 
 def default_matching(photos: Path) -> str:
-    """Return the default matching: for the frames of a video, with their neighbours."""
-    return "sequential" if is_video(photos) else "exhaustive"
+    """Return the default matching: of the frames of a video neighbours, of photographs more where these fail."""
+    return "sequential" if is_video(photos) else "auto"
 
 
 def run_sfm(
@@ -94,12 +82,13 @@ def run_sfm(
     long_side : int
         Photographs with a longer side are shrunk to this, pixels.
     matching : str, optional
-        "exhaustive": every pair. "sequential": neighbours in the order of file names, for videos, whose default it is.
+        "auto": neighbours in time, and every pair if that leaves photographs without a place. "exhaustive": every pair.
+        "sequential": neighbours alone, for videos, whose default it is.
     every : int, optional
         Frames of a video of which the sharpest is kept; those of half a second by default.
     features : str
         "standard": COLMAP's own setting. "dense": more features, matched more thoroughly, which takes longer. "auto":
-        standard, then dense if that leaves photographs without a place or gives few points; the better result is kept.
+        standard, then dense if that leaves photographs without a place; the better result is kept.
     camera_model : str
         COLMAP model that is estimated, for each group of photographs with one size, camera and focal length.
     up : str, optional
@@ -130,11 +119,11 @@ def run_sfm(
         n_photos = len(photographs.originals)
         if n_photos < 2:
             raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")
-        best, others, n_matches, groups = _reconstruct(photographs, work, matching, features, camera_model)
+        best, others, n_matches, groups, parts = reconstruct(photographs, work, matching, features, camera_model)
         _check_placed(best, n_photos, photos, matching)
         (work / "sparse" / "0").mkdir(parents=True)
         best.model.write(work / "sparse" / "0")
-        written = undistort_colmap(work, colmap_photos(work, best.model), folder)
+        written = undistort_colmap(work, colmap_photos(work), folder)
         upright = record_up(folder, photographs, up)
     placed = {image.name for image in best.model.images.values() if image.has_pose}
     return SfmResult(
@@ -151,58 +140,8 @@ def run_sfm(
         n_masks=len(photographs.masked),
         sizes=tuple((photo.camera.width, photo.camera.height) for photo in written),
         up=upright,
+        parts=parts,
     )
-
-
-def _reconstruct(
-    photographs: Photographs, work: Path, matching: str, features: str, camera_model: str
-) -> tuple[Mapped, list[Mapped], int, Mapping[Group, list[str]]]:
-    """Return the best result, the others, the number of matches they were judged with, and the groups of one camera."""
-    all_pairs = pairs_to_match(list(photographs.originals), matching)
-    given = photographs.groups
-    n_photos = len(photographs.originals)
-
-    def attempt(kind: Features, pairs: list[Pair]) -> tuple[list[Mapped], list[Matches]]:
-        nonlocal photographs
-        folder = work / kind.name
-        folder.mkdir()
-        database = folder / "database.db"
-        find_features(database, photographs, kind, camera_model)
-        match_features(database, folder, pairs, kind)
-
-        def remap(name: str, groups: dict[Group, list[str]]) -> list[Mapped]:
-            regrouped = folder / f"{name}.db"
-            copy_database(database, regrouped, photographs._replace(groups=groups), camera_model)
-            return map_photographs(regrouped, photographs.images, folder / name, kind.name, n_photos)
-
-        results = map_photographs(database, photographs.images, folder, kind.name, n_photos)
-        matches = read_matches(database)
-        best, others = choose(results, matches)
-        shown = best
-        if best.n_placed < ZOOM_SHARE * n_photos and (own := own_groups(photographs.groups)):
-            shown = max(remap("own", own), key=lambda result: result.n_placed)
-        kept = [best, *others]
-        for i in range(ROUNDS):
-            groups = split_groups(shown.model, given)
-            if {*map(tuple, groups.values())} == {*map(tuple, photographs.groups.values())}:
-                break
-            zoomed = remap(f"zoomed{i}", groups)
-            shown = max(zoomed, key=lambda result: result.n_placed)
-            if shown.n_placed < best.n_placed:
-                break
-            kept, photographs = zoomed, photographs._replace(groups=groups)
-        return kept, matches
-
-    results, matches = attempt(STANDARD, all_pairs)
-    best, others = choose(results, matches)
-    is_enough = best.n_placed == n_photos and best.n_points >= POINTS_MIN * n_photos
-    if features == "dense" or (features == "auto" and not is_enough):
-        images = [] if best.model is None else best.model.images.values()
-        placed = frozenset(image.name for image in images if image.has_pose)
-        pairs = overlapping_pairs(work / STANDARD.name / "database.db", all_pairs, placed)
-        dense, matches = attempt(DENSE, pairs)
-        best, others = choose(dense if features == "dense" else [best, *others, *dense], matches)
-    return best, others, sum(len(pair.first) for pair in matches), photographs.groups
 
 
 def _check_placed(best: Mapped, n_photos: int, photos: Path, matching: str) -> None:

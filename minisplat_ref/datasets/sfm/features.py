@@ -12,6 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
 from minisplat_ref.datasets.sfm.photographs import Photographs
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import progress_bar
@@ -142,22 +146,50 @@ def overlapping_pairs(database: Path, pairs: Sequence[Pair], placed: frozenset[s
     placed : frozenset of str
         Names of photographs whose cameras were found.
     """
-    pycolmap = import_quiet_pycolmap()
-    with opened(database) as content:
-        names = {image.image_id: image.name for image in content.read_all_images()}
-        ids, counts = content.read_two_view_geometry_num_inliers()
     partners: dict[str, list[tuple[int, str]]] = {}
-    for pair_id, count in zip(ids, counts, strict=True):
-        if count >= MATCHES_MIN:
-            a, b = (names[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
-            partners.setdefault(a, []).append((count, b))
-            partners.setdefault(b, []).append((count, a))
+    for (a, b), count in _count_matches(database).items():
+        partners.setdefault(a, []).append((count, b))
+        partners.setdefault(b, []).append((count, a))
     chosen = {
         frozenset((name, other))
         for name, others in partners.items()
         for _, other in sorted(others, reverse=True)[:PARTNERS]
     }
     return [pair for pair in pairs if frozenset(pair) in chosen or not placed.issuperset(pair)]
+
+
+def is_connected(database: Path) -> bool:
+    """Return whether chains of pairs that match lead from each photograph to every other."""
+    with opened(database) as content:
+        rows = {image.name: row for row, image in enumerate(content.read_all_images())}
+    pairs = [(rows[a], rows[b]) for a, b in _count_matches(database)]
+    first, second = np.array(pairs, int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(pairs)), (first, second)), shape=(len(rows), len(rows)))
+    return connected_components(graph, directed=False, return_labels=False) == 1
+
+
+def reaches(database: Path, placed: frozenset[str]) -> bool:
+    """Return whether a photograph without a place matches two with one, as it must to find one."""
+    partners: dict[str, int] = {}
+    for pair in _count_matches(database):
+        lost = [name for name in pair if name not in placed]
+        if len(lost) == 1:
+            partners[lost[0]] = partners.get(lost[0], 0) + 1
+    return max(partners.values(), default=0) >= min(2, len(placed))
+
+
+def _count_matches(database: Path) -> dict[Pair, int]:
+    """Return the verified matches of the pairs that overlap."""
+    pycolmap = import_quiet_pycolmap()
+    with opened(database) as content:
+        names = {image.image_id: image.name for image in content.read_all_images()}
+        ids, counts = content.read_two_view_geometry_num_inliers()
+    found = {}
+    for pair_id, count in zip(ids, counts, strict=True):
+        if count >= MATCHES_MIN:
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            found[names[a], names[b]] = int(count)
+    return found
 
 
 @contextmanager

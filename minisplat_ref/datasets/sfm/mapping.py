@@ -9,6 +9,7 @@ A point that only two photographs see is kept if it projects closely. COLMAP lea
 no camera, but training can start from them.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,8 +41,8 @@ class Mapped(NamedTuple):
     """Matches that the cameras explain, see :mod:`.judging`."""
 
 
-def map_photographs(database: Path, images: Path, work: Path, features: str, n_photos: int) -> list[Mapped]:
-    """Return the results of both mappers, in the order of MAPPERS.
+def map_photographs(database: Path, images: Path, work: Path, features: str, n_photos: int) -> Iterator[Mapped]:
+    """Yield the result of each mapper, in the order of MAPPERS; a mapper runs when its result is asked for.
 
     Parameters
     ----------
@@ -57,7 +58,6 @@ def map_photographs(database: Path, images: Path, work: Path, features: str, n_p
         For the progress bar.
     """
     pycolmap = import_quiet_pycolmap()
-    results = []
     for mapper in MAPPERS:
         folder = work / mapper
         folder.mkdir(parents=True)
@@ -75,8 +75,7 @@ def map_photographs(database: Path, images: Path, work: Path, features: str, n_p
                 found = pycolmap.global_mapping(database, images, folder, options)
             models = [complete(model, database, images, folder) for model in found.values()]
         models = sorted((model for model in models if model.num_reg_images() > 0), key=_size, reverse=True)
-        results.append(_result(mapper, features, models))
-    return results
+        yield _result(mapper, features, models)
 
 
 def complete(model: Any, database: Path, images: Path, work: Path) -> Any:

@@ -9,6 +9,7 @@ out. An alpha channel is a mask, and so is a file in ``masks/`` beside the photo
 import math
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +33,7 @@ from minisplat_ref.io.images import (
 from minisplat_ref.types import Bools
 
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
+TIME_TAGS = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 
 
@@ -67,6 +69,8 @@ class Photographs(NamedTuple):
     """Folder of the masks of copies, named as COLMAP does."""
     masked: frozenset[str]
     """Names of the photographs that have a mask."""
+    ordered: list[str]
+    """Names in the order in which the photographs were taken, as far as EXIF data or their names tell."""
 
 
 def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
@@ -92,6 +96,7 @@ def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
     groups: dict[Group, list[str]] = {}
     masked = set()
     used = set()
+    times: dict[str, str] = {}
     for file in with_progress(list_images(source), "reading", "photographs"):
         relative = file.relative_to(source)
         name = _name_copy(relative)
@@ -99,7 +104,7 @@ def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
             raise InputError(f"{file}: another photograph is called {name}; give each its own name, suffix aside")
         originals[name] = relative
         mask_file = find_mask(source, relative)
-        group, mask = _copy(file, mask_file, images / name, long_side)
+        group, mask, times[name] = _copy(file, mask_file, images / name, long_side)
         groups.setdefault(group, []).append(name)
         if mask is not None:
             masked.add(name)
@@ -108,7 +113,19 @@ def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
         if mask_file is not None:
             used.add(mask_file)
     _warn_of_unused(source, used)
-    return Photographs(source, images, originals, groups, masks, frozenset(masked))
+    return Photographs(source, images, originals, groups, masks, frozenset(masked), order(times))
+
+
+def order(times: Mapping[str, str]) -> list[str]:
+    """Return the names of photographs in the order of their times, or of the names if not all have a time.
+
+    Parameters
+    ----------
+    times : mapping of str to str
+        As EXIF data have them, so that the order is that of the alphabet; "" if unknown.
+    """
+    names = sorted(times)
+    return sorted(names, key=lambda name: times[name]) if all(times.values()) else names
 
 
 def _name_copy(original: Path) -> str:
@@ -124,11 +141,11 @@ def find_mask(source: Path, relative: Path) -> Path | None:
     return next((file for file in candidates if file.is_file()), None)
 
 
-def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> tuple[Group, Bools | None]:
-    """Write the copy of a photograph; return its group, and its mask at the copy's size if it has one."""
+def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> tuple[Group, Bools | None, str]:
+    """Write the copy of a photograph; return its group, its mask at the copy's size if it has one, and its time."""
     with open_image(file) as opened:
         check_flat(opened)
-        exif = _focal_exif(opened)
+        exif, time = _focal_exif(opened), _time(opened)
         pixels = decode_pixels(ImageOps.exif_transpose(opened))  # [H, W, 3 or 4], upright
     mask = None if pixels.shape[2] == 3 else pixels[..., 3] >= MASK_THRESHOLD
     if mask_file is not None:
@@ -143,7 +160,7 @@ def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> t
     image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
     target.parent.mkdir(parents=True, exist_ok=True)
     image.save(target, exif=exif, **SAVE_OPTIONS["JPEG"])  # PNG ignores these options
-    return _group(image, exif), None if mask is None else resize_mask(mask, *image.size)
+    return _group(image, exif), None if mask is None else resize_mask(mask, *image.size), time
 
 
 def _focal_exif(image: Image.Image) -> Image.Exif:
@@ -153,6 +170,13 @@ def _focal_exif(image: Image.Image) -> Image.Exif:
     lens = source.get_ifd(ExifTags.IFD.Exif)
     focal.get_ifd(ExifTags.IFD.Exif).update({tag: lens[tag] for tag in FOCAL_TAGS if tag in lens})
     return focal
+
+
+def _time(image: Image.Image) -> str:
+    """Return when a photograph was taken, with fractions of a second where they are known; "" if unknown."""
+    lens = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    time, fraction = (str(lens.get(tag, "")).strip(" \0") for tag in TIME_TAGS)
+    return f"{time}.{fraction}" if time.strip("0: ") else ""
 
 
 def _group(image: Image.Image, exif: Image.Exif) -> Group:
