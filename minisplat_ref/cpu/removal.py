@@ -52,7 +52,7 @@ def removal_changes(
         output.saved if output.saved is not None else records_of(projection, colors, conventions),
         pack_lists(bins),
         n_threads(),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         output.image.reshape(output.alpha.size, n_channels),
         slots,
     )

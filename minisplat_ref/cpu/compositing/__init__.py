@@ -74,7 +74,7 @@ def composite_with(
         background,
         pack_lists(bins),
         n_threads(),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         Pixels(image.reshape(height * width, image.shape[2]), alpha.reshape(-1)),
         HitStats(slots, median_depth, dominant_ids),
     )
@@ -107,7 +107,7 @@ def composite_vjp_with(
         output.saved if output.saved is not None else records_of(projection, colors, conventions),
         pack_lists(bins),
         n_threads(),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         Pixels(output.image.reshape(n_pixels, n_channels), output.alpha.ravel()),
         Pixels(v_image.reshape(n_pixels, n_channels), v_alpha.ravel()),
         slots,

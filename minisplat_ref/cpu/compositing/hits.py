@@ -48,7 +48,7 @@ def composite_hits(
     height, width, dtype, n_channels = bins.grid.height, bins.grid.width, colors.dtype, len(background)
     image, alpha = np.empty((height, width, n_channels), dtype), np.empty((height, width), dtype)
     records = _bundle(response, primitives, colors)
-    lists, frame = pack_lists(bins, response), pack_frame(bins, conventions, dtype)
+    lists, frame = pack_lists(bins, response), pack_frame(bins.grid, conventions, dtype)
     forward_kernel(_find_shared(response), n_channels)(
         records, background, lists, frame, n_threads(), _pixels(image, alpha, dtype)
     )
@@ -93,7 +93,7 @@ def composite_hits_vjp(
     backward_kernel(_find_shared(response), n_channels)(
         _bundle(response, primitives, colors),
         pack_lists(bins, response),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         n_threads(),
         _pixels(output.image, output.alpha, dtype),
         _pixels(*v_output, dtype),
@@ -123,7 +123,7 @@ def removal_changes_of_hits(
     removal_kernel(_find_shared(response), n_channels)(
         _bundle(response, primitives, colors),
         pack_lists(bins, response),
-        pack_frame(bins, conventions, dtype),
+        pack_frame(bins.grid, conventions, dtype),
         n_threads(),
         np.ascontiguousarray(output.image, dtype).reshape(-1, n_channels),
         changes,

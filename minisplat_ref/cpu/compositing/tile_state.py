@@ -18,7 +18,7 @@ from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, lowest_bit, re
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.scheduling import dynamic_range
 from minisplat_ref.scalar.compositing import Frame
-from minisplat_ref.types import Floats, Ints, TileBins
+from minisplat_ref.types import Floats, Ints, TileBins, TileGrid
 
 N_STRIPS = TILE_WIDTH // WIDTH
 N_ROWS = N_STRIPS * TILE_HEIGHT  # bits of an integer
@@ -75,7 +75,7 @@ def pack_lists(bins: TileBins) -> TileLists:
     return TileLists(bins.tile_offsets, bins.gaussian_ids, bins.slots)
 
 
-def pack_frame(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
+def pack_frame(grid: TileGrid, conventions: Conventions, dtype: np.dtype) -> Frame:
     """Return image size and thresholds in the form that kernels take."""
     least = dtype.type(conventions.transmittance_min)
     if conventions.stops_at_equality:
@@ -87,7 +87,7 @@ def pack_frame(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Fra
         conventions.alpha_max if conventions.clamp_stops_mean_gradient else np.inf,
         conventions.alpha_max if conventions.clamp_stops_shape_gradient else np.inf,
     )
-    return Frame(bins.grid.width, bins.grid.height, *(dtype.type(value) for value in thresholds))
+    return Frame(grid.width, grid.height, *(dtype.type(value) for value in thresholds))
 
 
 @scalar

@@ -26,7 +26,8 @@ other half.
 (:mod:`minisplat_ref.training.dense_start`).
 
 *Look through.* Gaussians that lie before sparse points which photographs show are removed every 100 iterations, and
-those beside a camera, nearer than what is known around it.
+those beside a camera, nearer than what is known around it. So are those that are mostly seen where masks leave pixels
+out.
 
 *Prune.* While the rates fall, Gaussians that the photographs would hardly miss are removed in slices.
 
@@ -41,7 +42,7 @@ those beside a camera, nearer than what is known around it.
 ``pose``          the pose of each photograph
 ``antialiasing``  compensated opacities, where photographs differ in resolution
 ``sky``           a sky behind the scene
-``veils``         Gaussians before sparse points that photographs show or beside cameras, which are removed
+``veils``         Gaussians before sparse points that photographs show, beside cameras or outside masks: removed
 ``prune``         removal of Gaussians while the rates fall
 ================  ==================================================================================================
 """

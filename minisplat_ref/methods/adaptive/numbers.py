@@ -1,8 +1,9 @@
 """All numbers of ``adaptive``, each with its meaning, its unit, and the reason for its value as far as one is recorded.
 
 Letters name the sections of ``docs/measured/adaptive.md``. ``--set`` reaches those that an action takes as a setting.
-Two numbers are shared with others: how far halves are apart (:data:`minisplat_ref.strategy.halving.OFFSET`), and the
-minimum side of halved views (:data:`minisplat_ref.training.smaller_views.SIDE_MIN`).
+Three numbers are shared with others: how far halves are apart (:data:`minisplat_ref.strategy.halving.OFFSET`), the
+minimum side of halved views (:data:`minisplat_ref.training.smaller_views.SIDE_MIN`), and the measurements to fit a line
+through (:data:`minisplat_ref.training.pace.MEASUREMENTS_MIN`).
 """
 
 # --- the recipe ---
@@ -52,8 +53,6 @@ VIEW_SIDE_MIN = 120
 where there are none (J)."""
 WHOLE_VIEWS_UNTIL = 1
 """Iteration after which large views are halved. No reason recorded."""
-MEASUREMENTS_MIN = 4
-"""Measurements to fit a line through."""
 SLOPE_MIN = 0.3
 """dB for each doubling of the work that held-out views must gain for a training to continue as it is. Leaving small
 views at 1 dB is much faster on fox and snowmiku, and ends lower (J)."""
@@ -124,6 +123,12 @@ before it lies within half of their distance."""
 CLEARANCE_SIGMAS = 1.0
 """Standard deviations that a Gaussian is blurred by the ball. With two, bare walls that training has not yet sharpened
 count as fog: 78 of their Gaussians, not 22 (M)."""
+
+MASK_SHARE = 0.5
+"""Of a Gaussian's weight in training views, below which masks say that it is not of the scene: more of it is where no
+pixel counts than where one does (R)."""
+MASK_VIEWS_MAX = 24
+"""Photographs with masks that are looked at each time, at most, as many as for a sky."""
 
 # --- pruning ---
 

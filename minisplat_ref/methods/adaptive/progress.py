@@ -2,10 +2,18 @@
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive.numbers import MEASUREMENTS_MIN
-from minisplat_ref.metrics import psnr, ssim
+from minisplat_ref.metrics import correct_colors, psnr, ssim
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.pace import COOLED, FINER, Cooling, Decision, Measurement, held_out_ids
+from minisplat_ref.training.calibration import EXPOSURES
+from minisplat_ref.training.pace import (
+    COOLED,
+    FINER,
+    Cooling,
+    Decision,
+    Measurement,
+    gains_per_doubling,
+    held_out_ids,
+)
 from minisplat_ref.training.state import Iteration, TrainState, begin_cooling
 
 
@@ -21,13 +29,20 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
 def evaluate_held_out(
     state: TrainState, iteration: Iteration, cooling: Cooling, *, has_ssim: bool = False
 ) -> Measurement:
-    """Return the PSNR of the held-out training views, and the SSIM on request."""
-    views = iteration.scene.train_views
+    """Return the PSNR of the held-out training views, and the SSIM on request.
+
+    Each has the pose that ``turn_held_out`` gives it. Where photographs have exposures, those of views that are not
+    trained on stay as they were before the training; their error would hide what the training gains, so colours are
+    corrected first.
+    """
+    views, has_exposures = iteration.scene.train_views, EXPOSURES in state.shared
     ids, psnrs, ssims = held_out_ids(len(views), cooling.hold_out_every), [], []
-    for index in ids:  # each has its own exposure, if there are any, and the pose that turn_held_out gives it
+    for index in ids:
         view = views[index].load()
         output, _ = iteration.render_settings.render_view(state.model, view)
         image = np.clip(output.image, 0.0, 1.0)
+        if has_exposures:
+            image = correct_colors(image, view.image, view.mask)
         psnrs.append(psnr(image, view.image, view.mask))
         if has_ssim:
             ssims.append(ssim(image, view.image, view.mask))
@@ -53,11 +68,9 @@ def proceed_when_little_is_gained(
     pace = state.pace
     if iteration.cooling is None or pace.cooling_from is not None or iteration.step < min_step:
         return None
-    recent = pace.recent()
-    if len(recent) < MEASUREMENTS_MIN:
+    slopes = gains_per_doubling(pace.recent())
+    if slopes is None:
         return None
-    doublings = np.log2([m.n_pairs for m in recent])
-    slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB per doubling
     gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
     if gain >= min_gain:
         return f"{gain:.2f} dB from twice the work"

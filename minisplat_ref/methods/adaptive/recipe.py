@@ -65,6 +65,7 @@ ADAPTIVE = GS._replace(
                 max_share_before=numbers.VEIL_SHARE,
                 min_weight_before=numbers.VEIL_WEIGHT_MIN,
                 clearance=numbers.CLEARANCE,
+                min_share_counted=numbers.MASK_SHARE,
                 start=numbers.VEIL_START,
             )
         ),

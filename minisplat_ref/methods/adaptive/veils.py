@@ -6,20 +6,28 @@ fog. Its error is invisible in the training photographs, and its opacity gets no
 :mod:`minisplat_ref.strategy.line_of_sight` computes which part of a Gaussian's contribution to the rays of sparse
 points lies in front of these points, and Gaussians with a large part are removed. Those on no such ray are judged by
 :mod:`minisplat_ref.strategy.camera_clearance` alone: beside a camera, nearer than what is known around it, there is
-nothing, though no photograph looks there but from the far side.
+nothing, though no photograph looks there but from the far side. Where photographs have masks, those that are mostly
+seen where no pixel counts go as well (:mod:`minisplat_ref.strategy.mask_weights`).
 """
 
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive.numbers import CLEARANCE_SIGMAS, PERIOD, VEIL_RAYS_MAX, VEIL_VIEWS_MAX
+from minisplat_ref.methods.adaptive.numbers import (
+    CLEARANCE_SIGMAS,
+    MASK_VIEWS_MAX,
+    PERIOD,
+    VEIL_RAYS_MAX,
+    VEIL_VIEWS_MAX,
+)
 from minisplat_ref.rendering import activate
 from minisplat_ref.strategy.camera_clearance import are_in_free_balls, find_free_balls
 from minisplat_ref.strategy.line_of_sight import MARGIN, trace_sight_lines
+from minisplat_ref.strategy.mask_weights import collect_mask_weights
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Bools, Floats
 
 
 def remove_veils(
@@ -29,9 +37,10 @@ def remove_veils(
     max_share_before: float,
     min_weight_before: float,
     clearance: float,
+    min_share_counted: float,
     start: int,
 ) -> str | None:
-    """Remove Gaussians that the sparse points of the training views, or their cameras, contradict.
+    """Remove Gaussians that the sparse points of the training views, their cameras, or their masks contradict.
 
     Parameters
     ----------
@@ -44,6 +53,8 @@ def remove_veils(
     clearance : float
         Radius of the free balls around cameras, in units of the distance of the nearest sparse points; with 0 there are
         none.
+    min_share_counted : float
+        A Gaussian stays if at least this share of its weight is at pixels that count, where photographs have masks.
     start : int
         Nothing is removed until this iteration: Gaussians that cover much at first lie on several surfaces.
     """
@@ -53,10 +64,35 @@ def remove_veils(
     is_veil = (before > max_share_before * all_) & (before >= min_weight_before)
     balls = find_free_balls(iteration.scene.train_views, iteration.scene.points, clearance)
     is_beside = are_in_free_balls(activate(state.gaussians), balls, CLEARANCE_SIGMAS) & ~is_veil
-    if (is_veil | is_beside).any():
-        apply_edit(state, keep(state.gaussians, ~(is_veil | is_beside)))
+    is_outside = are_outside_masks(state, iteration, min_share_counted, min_weight_before) & ~is_veil & ~is_beside
+    is_removed = is_veil | is_beside | is_outside
+    if is_removed.any():
+        apply_edit(state, keep(state.gaussians, ~is_removed))
     n_veils, n_beside = np.count_nonzero(is_veil), np.count_nonzero(is_beside)
-    return f"{n_veils} stood before points that photographs show, {n_beside} beside cameras"
+    message = f"{n_veils} stood before points that photographs show, {n_beside} beside cameras"
+    return f"{message}, {np.count_nonzero(is_outside)} outside the masks" if is_outside.any() else message
+
+
+def are_outside_masks(state: TrainState, iteration: Iteration, min_share_counted: float, min_weight: float) -> Bools:
+    """Return [N], whether less than a share of a Gaussian's weight is at pixels that count; False without masks.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action. At most :data:`MASK_VIEWS_MAX` training views are looked at, different ones each time.
+    min_share_counted : float
+        The share.
+    min_weight : float
+        Weight, in pixels, below which a Gaussian is none of these.
+    """
+    none = np.zeros(n_rows(state.gaussians), bool)
+    if min_share_counted == 0:
+        return none
+    views = _choose_evenly(iteration.scene.train_views, MASK_VIEWS_MAX, iteration.step // PERIOD)
+    if all(view.mask is None for view in views):  # photographs that are not in memory are read for it: these few alone
+        return none
+    inside, all_ = collect_mask_weights(state.model, views, iteration.render_settings)
+    return (inside < min_share_counted * all_) & (all_ >= min_weight)
 
 
 def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:

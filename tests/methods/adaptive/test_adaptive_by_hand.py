@@ -168,10 +168,11 @@ def test_held_out_views_are_measured_in_their_masks_and_as_they_are_shown():
     assert abs(measured.ssim - ssim(np.clip(image, 0, 1), photograph)) > 0.05  # the mask matters
 
 
-def test_held_out_views_have_their_own_exposure():
+def test_the_exposure_of_held_out_views_is_no_error_of_the_model():
     """A photograph of three quarters of the brightness is right to its rounding, 1 / (255 sqrt(12)), or 59 dB.
 
-    What the others have does not matter; with the identity it is a quarter of the brightness off, some 18 dB.
+    That is so with the exposure that its tracks may show, 0.6, which is wrong. In a training without exposures it is a
+    quarter of the brightness off, some 18 dB: then the model has to explain the difference, too.
     """
     rng = np.random.default_rng(1)
     truth = make_gaussians(np.random.default_rng(5), 30)
@@ -180,12 +181,11 @@ def test_held_out_views_have_their_own_exposure():
     darker = [np.round(255 * 0.75 * image).astype(np.uint8) for image in images]
     scene = scene_of([view_of(cameras[i], darker[i], view_id=i) for i in range(6)])
     exposed = RenderSettings(BACKGROUND, renderer=with_exposures(SPLATTING))
-    state, iteration = state_of(scene, truth), iteration_of(scene)._replace(render_settings=exposed)
-    state.shared, held = identity_exposures(6), held_out_ids(6, ADAPTIVE.cooling.hold_out_every)
+    state, iteration = state_of(scene, truth), iteration_of(scene)
     without = evaluate_held_out(state, iteration, ADAPTIVE.cooling)
-    state.shared[EXPOSURES][:, :, :3] = 1.3 * np.eye(3)
-    state.shared[EXPOSURES][held, :, :3] = 0.75 * np.eye(3)
-    measured = evaluate_held_out(state, iteration, ADAPTIVE.cooling)
+    state.shared = identity_exposures(6)
+    state.shared[EXPOSURES][held_out_ids(6, ADAPTIVE.cooling.hold_out_every), :, :3] = 0.6 * np.eye(3)
+    measured = evaluate_held_out(state, iteration._replace(render_settings=exposed), ADAPTIVE.cooling)
     assert_allclose(measured.psnrs, 20 * np.log10(255 * np.sqrt(12)), atol=1)
     assert max(without.psnrs) < 20
 

@@ -16,7 +16,7 @@ from scenes import make_camera
 
 CAMERA = make_camera(33, 33, fx=30.0, fy=30.0)
 POINTS = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]])
-SETTINGS = {"max_share_before": 0.5, "min_weight_before": 0.1, "clearance": 0.5, "start": 500}
+SETTINGS = {"max_share_before": 0.5, "min_weight_before": 0.1, "clearance": 0.5, "min_share_counted": 0.5, "start": 500}
 
 
 def gaussians(means, opacities, scale=0.1):
@@ -225,3 +225,54 @@ def test_a_wall_with_few_points_beside_a_camera(spacing, stays):
     state, iteration = setting(wall)
     veils.remove_veils(state, iteration._replace(scene=iteration.scene._replace(points=points)), **SETTINGS)
     assert (len(state.gaussians.means) == 2) == stays
+
+
+def masked(iteration, *masks):
+    """Return the iteration with a mask, or None, for each of its views, and no tracks."""
+    views = zip(iteration.scene.train_views, masks, strict=True)
+    views = tuple(v._replace(mask=mask, image=np.zeros((33, 33, 3), np.uint8), point_ids=None) for v, mask in views)
+    return iteration._replace(scene=iteration.scene._replace(train_views=views))
+
+
+LEFT = np.broadcast_to(np.arange(33) < 17, (33, 33))
+SIDES = [[-1.0, 0, 5], [1.0, 0, 5]]  # in the images, 6 pixels to the left and to the right of the middle
+
+
+def test_what_masks_leave_out_goes():
+    """Of two Gaussians, the one on the right is where nothing counts; with the least share 0 both stay."""
+    state, iteration = setting(gaussians(SIDES, [0.9, 0.9]))
+    iteration = masked(iteration, LEFT)
+    note = veils.remove_veils(state, iteration, **(SETTINGS | {"min_share_counted": 0.0}))
+    assert note == "0 stood before points that photographs show, 0 beside cameras"
+    note = veils.remove_veils(state, iteration, **SETTINGS)
+    assert note == "0 stood before points that photographs show, 0 beside cameras, 1 outside the masks"
+    np.testing.assert_array_equal(state.gaussians.means, np.float32(SIDES[:1]))
+
+
+@pytest.mark.parametrize(("masks", "n_left"), [((~LEFT, LEFT, LEFT), 1), ((LEFT, ~LEFT, None), 2), ((None,) * 3, 2)])
+def test_what_most_photographs_count_stays(masks, n_left):
+    """Someone who stands before a wall in one photograph of three does not take the wall away; two of three do."""
+    state, iteration = setting(gaussians(SIDES, [0.9, 0.9]), n_views=3)
+    veils.remove_veils(state, masked(iteration, *masks), **SETTINGS)
+    assert len(state.gaussians.means) == n_left
+
+
+@pytest.mark.parametrize(("inside", "is_out"), [(0.5, False), (0.49, True)])
+def test_half_of_the_weight_and_a_tenth_of_a_pixel_outside_masks(monkeypatch, inside, is_out):
+    weights = np.array([inside, 0.0, 0.0]), np.array([1.0, 0.1, 0.099])
+    monkeypatch.setattr(veils, "collect_mask_weights", lambda *_: weights)
+    state, iteration = setting(gaussians([[0, 0, 9]] * 3, [0.5] * 3))
+    found = veils.are_outside_masks(state, masked(iteration, LEFT), 0.5, 0.1)
+    np.testing.assert_array_equal(found, [is_out, True, False])
+
+
+def test_of_many_masks_others_are_looked_at_each_time(monkeypatch):
+    monkeypatch.setattr(veils, "MASK_VIEWS_MAX", 2)
+    seen = []
+    monkeypatch.setattr(
+        veils, "collect_mask_weights", lambda m, views, s: seen.extend(v.name for v in views) or (np.zeros(1),) * 2
+    )
+    for step in (600, 700):
+        state, iteration = setting(gaussians([[0, 0, 9]], [0.5]), n_views=5, step=step)
+        veils.are_outside_masks(state, masked(iteration, *[LEFT] * 5), 0.5, 0.1)
+    assert seen == ["0", "3", "1", "4"]
