@@ -1,13 +1,16 @@
 """The progress of a long step: a bar in a terminal, and where stderr is a log, a line now and then.
 
 Nothing is shown of a step that ends within SILENT_SECONDS, and nothing is left of a bar when its step has ended. A log,
-in which each redraw of a bar would stay, gets a line only every LOG_SECONDS.
+in which each redraw of a bar would stay, gets a line only every LOG_SECONDS. The first one comes as soon as the speed
+is known, if the step will take longer than that, so that its time is told before it is spent.
 """
 
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sized
 from typing import Any, Protocol, Self, TypeVar, cast
+
+from minisplat_ref.interface.remaining import Speed, format_interval
 
 Item = TypeVar("Item")
 
@@ -51,12 +54,17 @@ class _Log:
         self._description, self._unit, self._total, self._is_bytes = description, unit, total, is_bytes
         self._n: float = 0
         self._start = self._last = time.monotonic()
+        self._is_silent, self._speed = True, Speed(time.monotonic)
 
     def update(self, n: float = 1) -> None:
-        """Count, and write a line if the last one is old enough."""
+        """Count, and write a line if the last one is old enough, or the rest will be long."""
         self._n += n
+        self._speed.count(n)
         now = time.monotonic()
-        if now - self._last >= LOG_SECONDS:
+        rest = None if self._total is None else self._speed.seconds_of(self._total - self._n)
+        is_long = self._is_silent and rest is not None and rest >= LOG_SECONDS
+        if is_long or now - self._last >= LOG_SECONDS:
+            self._is_silent = False
             self._last = now
             print(f"minisplat-ref: {self._line(now - self._start)}", file=sys.stderr, flush=True)
 
@@ -67,10 +75,10 @@ class _Log:
     def _line(self, seconds: float) -> str:
         """Return the work done, the time that it took, and the time that the rest takes at that rate."""
         total = "" if self._total is None else f" of {self._number(self._total)}"
-        line = f"{self._description}: {self._number(self._n)}{total}{self._unit}, {_interval(seconds)} gone"
+        line = f"{self._description}: {self._number(self._n)}{total}{self._unit}, {format_interval(seconds)} gone"
         if self._total is None or not 0 < self._n < self._total:
             return line
-        return f"{line}, about {_interval(seconds * (self._total / self._n - 1))} to go"
+        return f"{line}, about {format_interval(seconds * (self._total / self._n - 1))} to go"
 
     def _number(self, n: float) -> str:
         return f"{n / 1e6:.1f}" if self._is_bytes else f"{n:,.0f}"
@@ -82,11 +90,15 @@ class _Log:
         pass
 
 
-def _interval(seconds: float) -> str:
-    """Return minutes and seconds, with hours where there are some."""
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes:02d}:{rest:02d}"
+def say(text: str) -> None:
+    """Write a line for a person, above the bar where a terminal shows one."""
+    line = f"minisplat-ref: {text}"
+    if not sys.stderr.isatty():
+        print(line, file=sys.stderr, flush=True)
+        return
+    from tqdm import tqdm
+
+    tqdm.write(line, file=sys.stderr)
 
 
 def progress_bar(description: str, unit: str = "", total: float | None = None, *, delay: float = SILENT_SECONDS) -> Bar:

@@ -96,6 +96,18 @@ def photometric(rendered: Rendered, *, dssim_weight: float) -> tuple[float, Cota
     return loss, Cotangents({"rgb": backend.photometric_loss_vjp(tape)})
 
 
+def photometric_of_part(rendered: Rendered, *, dssim_weight: float) -> tuple[float, Cotangents]:
+    """Compare the part of a photograph that its mask shows, weighed by its share of the pixels.
+
+    :func:`photometric` is a mean over the pixels that count. A pixel of a part would weigh more than in the whole
+    photograph, and gradients would pass the thresholds of densification sooner.
+    """
+    loss, v = photometric(rendered, dssim_weight=dssim_weight)
+    mask = rendered.view.mask
+    share = 1.0 if mask is None else float(mask.mean())
+    return share * loss, v._replace(channels={name: share * v_channel for name, v_channel in v.channels.items()})
+
+
 class Loss(NamedTuple):
     """The weighted sum of the terms."""
 

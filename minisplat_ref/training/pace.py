@@ -8,10 +8,15 @@ plateau is due to the scene and not to falling rates. Large photographs are halv
 train on views of twice the width and height.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from minisplat_ref.types import Floats
+
 COOLED, FINER = "cool down", "resolution"  # decisions: to let the rates fall, to train on larger views
+MEASUREMENTS_MIN = 4  # to fit a line through
 
 
 class Measurement(NamedTuple):
@@ -122,6 +127,18 @@ class Cooling(NamedTuple):
     def latest_start(self, iterations: int) -> int:
         """Return the iteration after which the cool-down has to begin to end at ``iterations``."""
         return max(1, int(iterations / (1.0 + self.part)))
+
+
+def gains_per_doubling(measurements: Sequence[Measurement]) -> Floats | None:
+    """Return the gain [V] of each view in dB for each doubling of the work, by lines through its measurements.
+
+    None if they are fewer than MEASUREMENTS_MIN.
+    """
+    if len(measurements) < MEASUREMENTS_MIN:
+        return None
+    doublings = np.log2([m.n_pairs for m in measurements])
+    slopes: Floats = np.polyfit(doublings, np.array([m.psnrs for m in measurements]), 1)[0]
+    return slopes
 
 
 def held_out_ids(n_views: int, every: int) -> list[int]:

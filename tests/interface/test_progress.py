@@ -6,7 +6,7 @@ import re
 import pytest
 
 from minisplat_ref.interface import progress
-from minisplat_ref.interface.progress import Lines, progress_bar, with_progress
+from minisplat_ref.interface.progress import Lines, progress_bar, say, with_progress
 
 
 class Terminal(io.StringIO):
@@ -28,13 +28,36 @@ def test_a_log_has_a_line_every_thirty_seconds_with_the_rest_by_the_rate(clock, 
     for k in with_progress(range(10), "fusing depths", "views"):
         clock[0] += 14.0 if k < 5 else 700.0
     assert capsys.readouterr().err.splitlines() == [
-        "minisplat-ref: fusing depths: 3 of 10 views, 00:42 gone, about 01:38 to go",  # 42 s (10/3 - 1)
+        "minisplat-ref: fusing depths: 2 of 10 views, 00:28 gone, about 01:52 to go",  # before it is spent
+        "minisplat-ref: fusing depths: 5 of 10 views, 01:10 gone, about 01:10 to go",  # 70 s (10/5 - 1)
         "minisplat-ref: fusing depths: 6 of 10 views, 12:50 gone, about 08:33 to go",  # 770 s (10/6 - 1)
         "minisplat-ref: fusing depths: 7 of 10 views, 24:30 gone, about 10:30 to go",
         "minisplat-ref: fusing depths: 8 of 10 views, 36:10 gone, about 09:02 to go",
         "minisplat-ref: fusing depths: 9 of 10 views, 47:50 gone, about 05:18 to go",
         "minisplat-ref: fusing depths: 10 of 10 views, 59:30 gone",
     ]
+
+
+def test_the_time_is_told_as_soon_as_two_seconds_are_measured_if_it_is_long(clock, capsys):
+    with progress_bar("matching", "pairs", 40) as bar:
+        for _ in range(5):
+            clock[0] += 1.0
+            bar.update()
+    assert capsys.readouterr().err == "minisplat-ref: matching: 3 of 40 pairs, 00:03 gone, about 00:37 to go\n"
+    with progress_bar("matching", "pairs", 30) as bar:
+        for _ in range(5):
+            clock[0] += 1.0
+            bar.update()
+    assert capsys.readouterr().err == ""  # 27 s and less
+
+
+def test_a_slow_beginning_is_no_long_step(clock, capsys):
+    with progress_bar("rendering", "views", 100) as bar:
+        clock[0] += 20.0
+        for _ in range(5):
+            bar.update()
+            clock[0] += 0.25
+    assert capsys.readouterr().err == ""
 
 
 def test_a_quick_step_leaves_nothing_in_a_log(clock, capsys):
@@ -78,6 +101,17 @@ def test_a_terminal_shows_nothing_of_a_quick_step(monkeypatch):
     monkeypatch.setattr("sys.stderr", terminal)
     assert len(list(with_progress(range(3), "quick"))) == 3
     assert terminal.getvalue() == ""
+
+
+def test_a_line_for_a_person_is_above_the_bar(monkeypatch, capsys):
+    say("in a log")
+    assert capsys.readouterr().err == "minisplat-ref: in a log\n"
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    with progress_bar("matching", "pairs", 40, delay=0.0) as bar:
+        bar.update()
+        say("in a terminal")
+    assert "minisplat-ref: in a terminal\n" in re.split("\r", terminal.getvalue())  # from the left edge
 
 
 def test_items_are_counted_when_their_work_is_done(clock, capsys):

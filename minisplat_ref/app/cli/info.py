@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from minisplat_ref.io.label import Label
     from minisplat_ref.types import Floats
 
-TEST_EVERY = 8  # of the photographs one is a test view, as where nothing else is asked for
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations", "lpips_reason")  # of metrics.json: too long, or said elsewhere
 
 Rows = list[tuple[str, str]]
@@ -221,7 +220,7 @@ def _scene_rows(path: Path, model: str | None) -> Rows:
     from minisplat_ref.io import list_scene
     from minisplat_ref.io.frames import place_scene
     from minisplat_ref.io.inventory import take_inventory
-    from minisplat_ref.io.scene import build_reading, build_scene
+    from minisplat_ref.io.scene import TEST_EVERY, build_reading, build_scene
 
     listing = list_scene(path, TEST_EVERY, model)
     photos = (*listing.train_photos, *listing.test_photos)

@@ -30,7 +30,7 @@ after recipe adaptive, which removes by itself what is not worth its place.
 NEW is a run folder for render, eval, info and convert, with point_cloud.ply,
 metrics.json, result.json (curve and decision), figure.png and report.html.
 Each size takes as long as 3 times --fine-tune iterations of training, and the
-search measures some 4 to 10 sizes.
+search measures at least 2; how long that will take is said when it begins.
 """
 EPILOG = """\
 example:

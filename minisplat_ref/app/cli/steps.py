@@ -16,14 +16,24 @@ def do(*words: str | Path) -> int:
 
 
 def make_page_and_film(run: Path, folder: Path, *up: str) -> bool:
-    """Write the page and the film of a run into a folder, where they are not there; return whether one was written."""
+    """Write the page and the film of a run into a folder; return whether one was written.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of the run.
+    folder : Path
+        Where they are. What is there stays, unless ``up`` is given.
+    *up : str
+        ``--up`` and what is up, where it is not what the run has recorded.
+    """
     from minisplat_ref.app.runs.next_steps import FILM, FILM_OPTIONS, PAGE
 
     page, film = folder / PAGE, folder / FILM
-    is_whole = page.exists() and film.exists()
-    if not page.exists():
+    is_whole = page.exists() and film.exists() and not up
+    if up or not page.exists():
         do("convert", run, page, *up)
-    if not film.exists():
+    if up or not film.exists():
         do("render", run, *FILM_OPTIONS, "--film", film, "--out", run / VIEWS, *up)
     return not is_whole
 

@@ -52,7 +52,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--blocks", type=_shape, metavar="AxB", help="in A x B parts; at once: --workers N, --cluster ADDRESS"
     )
-    add_settings(parser, "block")  # one of them
+    add_settings(parser, "block", "whole_iterations")  # one of them
     add_worker_arguments(parser, argparse.SUPPRESS, argparse.SUPPRESS)
     parser.add_argument("--view", nargs="?", type=integer(0), const=VIEWER_PORT, metavar="PORT", help=HIDDEN)
 

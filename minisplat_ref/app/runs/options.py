@@ -140,6 +140,9 @@ class Settings:
     """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
     block: Annotated[str | None, Option(HIDDEN, "PART", _absolute)] = None
     """Absolute path of a part of the scene, a :class:`~minisplat_ref.app.runs.scene_part.Part`; None for the whole."""
+    whole_iterations: Annotated[int | None, Option(HIDDEN, "N", integer(1))] = None
+    """Iterations of a training whose schedule this one has: as its beginning, or with ``block`` as a part that
+    continues the beginning ``init``; None for a training with a schedule of its own."""
     fold: Annotated[int, Option(HIDDEN, "N", integer(0))] = 0
     """Offset of the first held-out photograph, below ``test_every``: one fold of a cross-validation."""
 

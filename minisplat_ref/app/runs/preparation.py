@@ -5,10 +5,11 @@ from pathlib import Path
 
 from minisplat_ref import memory
 from minisplat_ref.app.runs import curve, fingerprint, memory_needs
+from minisplat_ref.app.runs.continued_part import continue_part
 from minisplat_ref.app.runs.opened_run import Run
 from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run import Training
-from minisplat_ref.app.runs.scene_part import read_region
+from minisplat_ref.app.runs.scene_part import keep_rows, read_region
 from minisplat_ref.app.runs.settings import (
     check_frame,
     configure_recipe,
@@ -80,13 +81,16 @@ def _check_minutes(minutes: float | None, recipe: Recipe) -> None:
 
 
 def _first_state(settings: Settings, scene: Scene, recipe: Recipe) -> TrainState:
-    """Return the state before the first iteration, from the scene's points or from what --init gives."""
+    """Return the state before the run's first iteration: from the scene's points, from --init, or of a whole."""
+    region = None if settings.block is None else read_region(Path(settings.block))
+    if settings.whole_iterations is not None and region is not None:
+        return continue_part(settings, region, scene)
     start = make_start(settings.init, scene, recipe, settings.seed)
     for notice in start.notices:
         print(f"minisplat-ref: {notice}", file=sys.stderr)
     if start.source is not None:
         print(f"starts from {start.source}")
-    return start.state if settings.block is None else read_region(Path(settings.block)).crop(start.state)
+    return start.state if region is None else keep_rows(start.state, region.find_rows(start.state))
 
 
 def simplification_target(settings: Settings) -> Target | None:

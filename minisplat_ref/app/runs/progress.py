@@ -12,11 +12,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from tqdm import tqdm
 
+from minisplat_ref.app.runs.outlook import Outlook
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import LOG_SECONDS, Lines
 from minisplat_ref.io.atomic import replacing, unwritable
 from minisplat_ref.metrics import psnr
-from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.state import StepReport
 
 LOG_EVERY = 5  # iterations; a PSNR is measured as often
@@ -37,10 +37,10 @@ class Clock(NamedTuple):
 class Progress(AbstractContextManager["Progress"]):
     """Bar and log of one training: a context manager that is called with every :class:`StepReport`."""
 
-    def __init__(self, log_path: Path, first_step: int, last_step: int | None, cooling: Cooling | None = None) -> None:
+    def __init__(self, log_path: Path, first_step: int, last_step: int | None, outlook: Outlook | None = None) -> None:
         records = [record for record in read_log(log_path) if record["step"] <= first_step]
         self._log_path, self._old_records = log_path, records
-        self._first_step, self._last_step, self._cooling = first_step, last_step, cooling
+        self._first_step, self._last_step, self._outlook = first_step, last_step, outlook
         self._before = Clock(records[-1]["seconds"], records[-1].get("cpu_seconds")) if records else Clock(0.0, 0.0)
         self._losses: list[float] = []
         self._psnrs: deque[float] = deque((record["psnr"] for record in records[-1:]), maxlen=PSNR_WINDOW)
@@ -98,6 +98,8 @@ class Progress(AbstractContextManager["Progress"]):
             self._bar.set_description_str("training", refresh=False)
             self._estimate_from_now()
         self._bar.update()
+        if self._outlook is not None:
+            self._outlook.observe(report, self.seconds)
         for note in report.notes:
             self._bar.write(f"minisplat-ref: {note}", file=sys.stderr)
         self._losses.append(report.loss)
@@ -121,24 +123,15 @@ class Progress(AbstractContextManager["Progress"]):
                 "its/s": report.step / seconds,
             },
         )
-        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {report.n_gaussians:,} Gaussians{self._min_rest(report)}"
-        self._bar.set_postfix_str(line, refresh=False)
+        rest = "" if self._outlook is None else self._outlook.describe(report)
+        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {report.n_gaussians:,} Gaussians"
+        self._bar.set_postfix_str(", ".join(filter(None, (line, rest))), refresh=False)
         self._losses.clear()
 
     def _estimate_from_now(self) -> None:
         """Leave the first iteration out of the bar's estimate: most of its time is compilation."""
         self._bar.start_t = self._bar.last_print_t = time.time()
         self._bar.initial = self._bar.last_print_n = self._bar.n + 1
-
-    def _min_rest(self, report: StepReport) -> str:
-        """Estimate the shortest rest of a training that has not decided its length: as if it began to cool now."""
-        if self._cooling is None or report.last_step is not None:
-            return ""
-        bar = self._bar.format_dict
-        rate = bar["rate"] or (bar["n"] - bar["initial"]) / bar["elapsed"]  # the first is of the last few iterations
-        if rate <= 0:
-            return ""
-        return f", at least {tqdm.format_interval(self._cooling.part * report.step / rate)} to go"
 
 
 def write_log(path: Path, records: Iterable[dict[str, Any]]) -> None:

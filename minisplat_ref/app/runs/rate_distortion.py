@@ -5,8 +5,12 @@ differences d_v = PSNR_v(before) - PSNR_v(after), in which the difficulty of eac
 
     drop = mean of d_v,   standard error = sqrt(sum (d_v - drop)^2 / (V - 1) / V)
 
-A size is within a limit if its drop plus one standard error is. The search goes down from all Gaussians by factors of
-sqrt(2) to the first size that is not within the limit, and then halves the interval on a logarithmic scale.
+A size is within a limit if its drop plus one standard error is. The search goes down from all Gaussians. Its first
+step is the smallest that is worth making; if that is not within the limit, nothing is, and the search ends. The least
+important Gaussians go first, so each further step costs more. With ``x = log(all / size)`` the drop rises about with
+the square of x, which gives the next size, and at least in proportion to x: once a drop w at x is within the limit,
+nothing beyond ``x limit / w`` is, and the search ends where that is no worthwhile step away. Between a size within
+the limit and one that is not, it halves the interval of x.
 
 There is no knee. Where the PSNR falls evenly with the logarithm of the count, as it does once a training has removed
 what it does not need, the place of a knee depends on the first and last measured size, and may cost many dB.
@@ -19,8 +23,8 @@ import numpy as np
 
 from minisplat_ref.app.runs.progress import PSNR_MAX
 
-STEP = 2**0.5  # ratio of neighbouring sizes while all are within the limit
-CLOSE = 1.1  # ratio of the smallest size within the limit to the next smaller one, at which the search ends
+STEP = 2**0.5  # ratio of neighbouring sizes while all are within the limit, at most
+CLOSE = 1.1  # ratio of the smallest worthwhile step, and of the result to any smaller size that might do, at the end
 
 
 class Point(NamedTuple):
@@ -107,15 +111,47 @@ def next_size(points: Sequence[Point], n: int, n_candidates: int, max_drop: floa
     max_drop : float
         dB, for the drop plus one standard error.
     """
-    upper = min((point.n_gaussians for point in points if point.worst <= max_drop), default=n)
+    best = smallest_within(points, max_drop)
+    if best is None:
+        size = min(int(n / CLOSE), n_candidates)
+        return size if 0 < size < n and not points else None
+    upper = best.n_gaussians
     lower = max((point.n_gaussians for point in points if point.n_gaussians < upper), default=None)
-    if lower is None:
-        size = min(round(upper / STEP), n_candidates)
-    elif upper <= CLOSE * lower:
+    if upper <= CLOSE * max(lower or 0, _smallest_possible(best, n, max_drop)):
         return None
-    else:
+    if lower is not None:
         size = round((lower * upper) ** 0.5)
-    return size if (lower or 0) < size < upper and size <= n_candidates else None
+    else:
+        x = np.log(n / upper)
+        ratio = STEP if best.worst <= 0 else np.exp(x * (np.sqrt(max_drop / best.worst) - 1.0))
+        size = int(upper / np.clip(ratio, CLOSE, STEP))
+    return size if (lower or 0) < size < upper else None
+
+
+def _smallest_possible(best: Point, n: int, max_drop: float) -> float:
+    """Return the Gaussians below which nothing is within the limit, if the drop is at least in proportion to x."""
+    return 0.0 if best.drop <= 0 else float(n * (best.n_gaussians / n) ** (max_drop / best.drop))
+
+
+def count_sizes(points: Sequence[Point], n: int, n_candidates: int, max_drop: float) -> tuple[int, int | None]:
+    """Return how many sizes the search has yet to measure, at least and at most; None where that is open.
+
+    Parameters
+    ----------
+    points, n, n_candidates, max_drop
+        As for :func:`next_size`.
+    """
+    size = next_size(points, n, n_candidates, max_drop)
+    if size is None:
+        return 0, 0
+    best = smallest_within(points, max_drop)
+    if best is None or best.drop <= 0:
+        return 1, None
+    # The drop of the next size is at least in proportion to x, and may be more than the limit.
+    least = best.drop * np.log(size / n) / np.log(best.n_gaussians / n)
+    outcomes = [Point(size, 0, (), (), drop, 0.0) for drop in (least, np.inf)]
+    further = [count_sizes([*points, outcome], n, n_candidates, max_drop)[1] or 0 for outcome in outcomes]
+    return 1, 1 + max(further)
 
 
 def smallest_within(points: Sequence[Point], max_drop: float) -> Point | None:

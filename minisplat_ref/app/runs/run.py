@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.app.runs import checkpoints, curve, events, fingerprint, run_folder
 from minisplat_ref.app.runs.options import Settings
+from minisplat_ref.app.runs.outlook import Outlook, make_plan
 from minisplat_ref.app.runs.progress import Clock, Progress
 from minisplat_ref.app.runs.scoring import score, to_metrics
 from minisplat_ref.app.runs.settings import save_model, to_config
@@ -93,12 +94,13 @@ def run_training(training: Training) -> Outcome:
     with saving_on_error(folder, recipe, state):
         run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
         run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.take_fingerprint(scene))
-        if state.step == 0:
+        begins = checkpoints.read_step(folder) is None
+        if begins:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
         total = settings.iterations if recipe.cooling is None else state.pace.last_step
-        progress = Progress(folder / run_folder.LOG, state.step, total, recipe.cooling)
-        on_step = _make_callback(training, progress, surface)
+        progress = Progress(folder / run_folder.LOG, state.step, total, _make_outlook(training))
+        on_step = _make_callback(training, progress, surface, begins)
         with progress:
             with contextlib.suppress(KeyboardInterrupt):
                 train(
@@ -114,6 +116,13 @@ def run_training(training: Training) -> Outcome:
             clock = progress.clock
         evaluation = _measure(training, clock, surface) if _save(training) else None
         return Outcome(evaluation, clock.seconds, state.step >= last_step(state, recipe, settings.iterations))
+
+
+def _make_outlook(training: Training) -> Outlook | None:
+    """Return what estimates the rest of a training that decides its own length."""
+    plan = make_plan(training.recipe, training.settings.iterations, len(training.scene.train_views))
+    minutes = training.settings.minutes
+    return None if plan is None else Outlook(plan, training.state, None if minutes is None else 60 * minutes)
 
 
 @contextmanager
@@ -135,11 +144,13 @@ def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator
         raise
 
 
-def _make_callback(training: Training, progress: Progress, surface: Surface | None) -> Callable[[StepReport], None]:
+def _make_callback(
+    training: Training, progress: Progress, surface: Surface | None, begins: bool
+) -> Callable[[StepReport], None]:
     """Return the callback of the loop: records, measurements and checkpoints."""
     folder, scene, settings, recipe, state = training[:5]
     callbacks: list[Callable[[StepReport], None]] = [progress]
-    if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
+    if begins or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
         curve.keep_until(folder / run_folder.EVENTS, state.step)
         callbacks.append(_record_events(folder / run_folder.EVENTS))
     if settings.eval_every:
@@ -180,7 +191,7 @@ def _cool_within_minutes(
         left -= cooling.prune_passes * n_views * pace
         if left > length * pace:
             return
-        why = f"{minutes:g} minutes leave no more time"
+        why = f"--minutes {minutes:g} leaves no more time"
         if report.n_halvings:
             state.pace = state.pace.with_decision(Decision(report.step, FINER, why, None, None))
             clock.clear()  # of faster iterations

@@ -12,7 +12,7 @@ import numpy as np
 from minisplat_ref import __version__
 from minisplat_ref.app.runs.model_file import make_label
 from minisplat_ref.app.runs.options import FIRST_NAMES, NAMES, Settings, first_wrong
-from minisplat_ref.app.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
+from minisplat_ref.app.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object, write_json
 from minisplat_ref.app.runs.scene_part import read_part
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE, Extension, find_recipe, owner_of
@@ -33,14 +33,14 @@ from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.io.scene import Listing, build_reading, build_scene
-from minisplat_ref.io.upright import Up, find_up, read_up, up_from_json, up_to_json
+from minisplat_ref.io.upright import FILE, Up, find_up, read_up, up_from_json, up_to_json
 from minisplat_ref.mechanisms.cameras.models import check_optics
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics.lpips import Network, check_views, load_network
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.calibration import SHIFTS
 from minisplat_ref.training.recipe_settings import configure, parse_settings, settings_of
-from minisplat_ref.training.schedule import Recipe, describe
+from minisplat_ref.training.schedule import Recipe, compress_recipe, describe
 from minisplat_ref.types import FILE_FRAME, NOTHING, Floats, Frame, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
@@ -57,7 +57,8 @@ def configure_recipe(settings: Settings) -> Recipe:
     InputError
         There is no such recipe or extension, or the recipe has no such setting.
     """
-    recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
+    whole = settings.whole_iterations
+    recipe = find_recipe(settings.recipe, whole or settings.schedule_iterations, extension=settings.extension)
     recipe = configure(recipe, **parse_settings(recipe, settings.set))
     options = {
         "--budget": ("budget", settings.budget),
@@ -71,7 +72,7 @@ def configure_recipe(settings: Settings) -> Recipe:
             others = ", ".join(other.name for other in RECIPES.values() if name in settings_of(other))
             raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
         recipe = configure(recipe, **{name: value})
-    return recipe
+    return recipe if whole is None or settings.block is None else compress_recipe(recipe, settings.schedule_iterations)
 
 
 def find_owner(settings: Settings) -> Extension:
@@ -180,6 +181,14 @@ def load_up(folder: Path) -> Up | None:
     return None if recorded is None else up_from_json(recorded, folder / CONFIG)
 
 
+def record_up(folder: Path, up: Up) -> None:
+    """Record what is up in the scene of a run, with the run, and with the scene for later ones."""
+    write_json(folder / CONFIG, {**_read_config(folder), "up": up_to_json(up)})
+    scene = Path(load(folder).scene)
+    if scene.is_dir():
+        write_json(scene / FILE, up_to_json(up))
+
+
 def load(folder: Path) -> Settings:
     """Read the settings of a run.
 
@@ -254,7 +263,7 @@ def load_photographs(settings: Settings, frame: Frame | None = None, listing: Li
     ----------
     settings : Settings
     frame : Frame, optional
-        That of the run; by default the one that suits the scene.
+        That of the run; by default the one that suits the scene, or that of the training that a part continues.
     listing : Listing, optional
         Of the whole scene; by default it is read, or that of the part.
 
@@ -278,6 +287,8 @@ def load_photographs(settings: Settings, frame: Frame | None = None, listing: Li
     )
     scene = build_scene(listing, reading)
     scene = scene if part is None else part.hide(scene)
+    if frame is None and part is not None and part.extent is not None and settings.init is not None:
+        frame = load_frame(Path(settings.init))
     for view in (*scene.train_views, *scene.test_views):
         try:
             check_optics(view.camera)

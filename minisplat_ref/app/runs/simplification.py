@@ -33,7 +33,15 @@ import numpy as np
 
 from minisplat_ref.app.runs.model_file import make_label
 from minisplat_ref.app.runs.opened_run import Run, check_renderer, check_views
-from minisplat_ref.app.runs.rate_distortion import PlySize, Point, next_size, paired_drop, smallest_within
+from minisplat_ref.app.runs.rate_distortion import (
+    PlySize,
+    Point,
+    count_sizes,
+    next_size,
+    paired_drop,
+    smallest_within,
+)
+from minisplat_ref.app.runs.simplification_time import SimplificationTime, Sizes
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import CORE
 from minisplat_ref.interface.progress import progress_bar
@@ -236,7 +244,12 @@ def evaluate_views(run: Run, model: Model, views: Sequence[View]) -> list[ViewMe
     return evaluate(model, views, run.render_settings).per_view
 
 
-def make_measure(run: Run, iterations: int) -> Callable[[int], Point]:
+def expect_time(run: Run, iterations: int) -> SimplificationTime:
+    """Return what tells how long the simplification of a run takes, with ``iterations`` of each fine-tuning."""
+    return SimplificationTime(len(run.folds) * iterations, iterations)
+
+
+def make_measure(run: Run, iterations: int, expected: SimplificationTime | None = None) -> Callable[[int], Point]:
     """Return the function that measures a number of Gaussians, each only once.
 
     Parameters
@@ -244,6 +257,8 @@ def make_measure(run: Run, iterations: int) -> Callable[[int], Point]:
     run : Run
     iterations : int
         Of each fine-tuning.
+    expected : SimplificationTime, optional
+        Counts the iterations.
 
     Raises
     ------
@@ -257,7 +272,7 @@ def make_measure(run: Run, iterations: int) -> Callable[[int], Point]:
 
     @cache
     def measure_size(count: int) -> Point:
-        measured = cross_validate(run, reduce(run, importance, count), iterations)
+        measured = cross_validate(run, reduce(run, importance, count), iterations, expected)
         psnrs, ssims = tuple(view.psnr for view in measured), tuple(view.ssim for view in measured)
         before = psnrs if count == n else measure_size(n).psnrs
         return Point(count, size.of(count), psnrs, ssims, *paired_drop(before, psnrs))
@@ -265,7 +280,9 @@ def make_measure(run: Run, iterations: int) -> Callable[[int], Point]:
     return measure_size
 
 
-def decide(run: Run, target: Target, measure_size: Callable[[int], Point]) -> Decision:
+def decide(
+    run: Run, target: Target, measure_size: Callable[[int], Point], expected: SimplificationTime | None = None
+) -> Decision:
     """Measure sizes until the target is met, and choose one.
 
     Parameters
@@ -274,6 +291,8 @@ def decide(run: Run, target: Target, measure_size: Callable[[int], Point]) -> De
     target : Target
     measure_size : callable
         See :func:`make_measure`.
+    expected : SimplificationTime, optional
+        Is told which sizes are planned.
 
     Raises
     ------
@@ -282,14 +301,27 @@ def decide(run: Run, target: Target, measure_size: Callable[[int], Point]) -> De
     """
     limit = find_limit(target, ply_size(run))
     n, n_candidates = n_rows(run.model.gaussians), int(np.count_nonzero(blend_weights(run)))
-    reference = measure_size(n)
     points: list[Point] = []
+
+    is_given = limit is not None and min(limit, n_candidates) < n
+
+    def plan(n_before: int = 0) -> None:
+        least, most = (
+            (is_given, is_given) if target.limit is None else count_sizes(points, n, n_candidates, target.limit)
+        )
+        if expected is not None:
+            expected.plan(Sizes(n_before + least, None if most is None else n_before + most))
+
+    plan(n_before=1)
+    reference = measure_size(n)
+    plan()
     chosen: Point | None = None
     if target.limit is not None:
         while (count := next_size(points, n, n_candidates, target.limit)) is not None:
             points.append(measure_size(count))
+            plan()
         chosen = smallest_within(points, target.limit)
-    elif limit is not None and min(limit, n_candidates) < n:
+    elif limit is not None and is_given:
         chosen = measure_size(min(limit, n_candidates))
         points.append(chosen)
     return Decision(
@@ -301,14 +333,22 @@ def decide(run: Run, target: Target, measure_size: Callable[[int], Point]) -> De
     )
 
 
-def cross_validate(run: Run, gaussians: Any, iterations: int) -> list[ViewMetrics]:
+def cross_validate(
+    run: Run, gaussians: Any, iterations: int, expected: SimplificationTime | None = None
+) -> list[ViewMetrics]:
     """Return the metrics of every training view, each of a copy of the Gaussians that was fine-tuned without it."""
     views, every_row = run.scene.train_views, np.arange(n_rows(gaussians))
     measured: dict[int, ViewMetrics] = {}
     with progress_bar(f"measuring {len(every_row):,} Gaussians", "iterations", len(run.folds) * iterations) as bar:
+
+        def count_step() -> None:
+            bar.update()
+            if expected is not None:
+                expected.count_iteration()
+
         for fold in run.folds:
             copy = take(gaussians, every_row)
-            model = fine_tune(run, copy, iterations, views=fold.trained, on_step=bar.update)
+            model = fine_tune(run, copy, iterations, views=fold.trained, on_step=count_step)
             held_out = evaluate_views(run, model, [views[k] for k in fold.held_out])
             measured.update(zip(fold.held_out, held_out, strict=True))
     return [measured[k] for k in range(len(views))]

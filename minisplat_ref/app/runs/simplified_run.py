@@ -16,7 +16,15 @@ from minisplat_ref.app.runs.opened_run import Run, open_run
 from minisplat_ref.app.runs.rate_distortion import Point, paired_drop
 from minisplat_ref.app.runs.scoring import score, to_metrics
 from minisplat_ref.app.runs.settings import save_model
-from minisplat_ref.app.runs.simplification import Decision, Target, decide, finish, is_merged, make_measure
+from minisplat_ref.app.runs.simplification import (
+    Decision,
+    Target,
+    decide,
+    expect_time,
+    finish,
+    is_merged,
+    make_measure,
+)
 from minisplat_ref.app.runs.simplification_report import Shown, plot, report_html
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
@@ -53,7 +61,8 @@ def simplify_run(options: SimplifyOptions) -> dict[str, Any]:
     """
     with making_folder(options.out) as folder:
         run = open_run(options.run, options.scene)
-        decision = decide(run, options.target, make_measure(run, options.fine_tune))
+        expected = expect_time(run, options.fine_tune)
+        decision = decide(run, options.target, make_measure(run, options.fine_tune, expected), expected)
         is_unchanged, n = decision.is_unchanged, decision.chosen.n_gaussians
         model = run.model if is_unchanged else finish(run, n, options.fine_tune)
         save_model(folder, run.settings, model, run.scene.frame)

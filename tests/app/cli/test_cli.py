@@ -120,6 +120,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "init": None,
         "background": None,
         "block": None,
+        "whole_iterations": None,
         "fold": 0,
         "model": None,
     }

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +12,7 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.reports.images import GAP
 from minisplat_ref.app.runs.notices import describe_sizes
 from minisplat_ref.app.runs.preview import FILE
-from minisplat_ref.app.runs.progress import Progress
 from minisplat_ref.io import load_ply, read_image
-from minisplat_ref.training.pace import Cooling
 from run_commands import write_room
 
 WIDTH, HEIGHT = 32, 24
@@ -65,16 +61,6 @@ def test_preview_of_a_run_that_goes_on(run_folder, tmp_path):
     assert main(["train", "--resume", str(folder), "--iterations", "15", "--preview"]) == 0
     first = sorted((folder / "renders").iterdir())[0]
     np.testing.assert_array_equal(read_image(folder / FILE), read_image(first))
-
-
-def test_least_rest_of_a_training_without_a_schedule(tmp_path):
-    """After 200 iterations at 100 a second a cool-down of half as many takes a second."""
-    cooling = Cooling(part=0.5, last=0.1, last_per_extent=0.1, hold_out_every=8)
-    with Progress(tmp_path / "log.jsonl", 0, None, cooling) as progress:
-        progress._bar.n, progress._bar.start_t = 200, time.time() - 2.0
-        undecided = progress._min_rest(SimpleNamespace(step=200, last_step=None))
-        assert undecided == ", at least 00:01 to go"
-        assert progress._min_rest(SimpleNamespace(step=200, last_step=300)) == ""
 
 
 def test_info_has_no_empty_rows(run_folder, capsys):

@@ -19,6 +19,7 @@ from minisplat_ref.app.runs import first_use
 from minisplat_ref.app.runs.notices import warn_of_model, warn_of_scene
 from minisplat_ref.datasets import sfm
 from minisplat_ref.datasets.photo_files import list_images
+from minisplat_ref.datasets.sfm import attempts
 from minisplat_ref.datasets.sfm.mapping import MAPPERS, Mapped
 from minisplat_ref.datasets.sfm.photographs import Group
 from minisplat_ref.errors import InputError, InputWarning
@@ -312,11 +313,11 @@ def test_summary_names_only_what_is_there(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize("matching", sfm_command.MATCHINGS)
 @pytest.mark.parametrize("n", [2, 3])
 def test_hardly_any_photograph_finds_a_place(tmp_path, capsys, monkeypatch, matching, n):
-    monkeypatch.setattr(sfm, "find_features", lambda *_: None)
-    monkeypatch.setattr(sfm, "match_features", lambda *_: None)
-    monkeypatch.setattr(sfm, "read_matches", lambda *_: [])
+    monkeypatch.setattr(attempts, "find_features", lambda *_: None)
+    monkeypatch.setattr(attempts, "match_features", lambda *_: None)
+    monkeypatch.setattr(attempts, "read_matches", lambda *_: [])
     results = [Mapped(name, "standard", SimpleNamespace(images={}), n, 9, ()) for name in MAPPERS]
-    monkeypatch.setattr(sfm, "map_photographs", lambda *_: results)
+    monkeypatch.setattr(attempts, "map_photographs", lambda *_: iter(results))
     (tmp_path / "photos").mkdir()
     for i in range(15):
         write_image(tmp_path / "photos" / f"{i}.png", colored_image(i))

@@ -1,6 +1,7 @@
 """``photos``: from photographs to a report and a film, what it prints, and that it continues."""
 
 import base64
+import json
 import re
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +14,10 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.cli import photos as photos_command
 from minisplat_ref.app.runs import next_steps
 from minisplat_ref.app.runs.proposed_size import comfortable_factor
+from minisplat_ref.app.runs.settings import load_up
+from minisplat_ref.errors import InputError
 from minisplat_ref.io import write_image
+from minisplat_ref.io.upright import read_up
 from run_commands import interrupt_at, write_room
 from textured_world import HEIGHT, WIDTH, take_photographs, write_photographs
 
@@ -99,6 +103,24 @@ def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):
     assert steps_of(capsys.readouterr().out) == []
 
 
+def test_another_up_makes_page_and_film_again_and_is_recorded(out, capsys):
+    assert photos(out, "--minutes", "0.1") == 0
+    page, film = (out / "scene.html").read_bytes(), (out / "film.gif").read_bytes()
+    capsys.readouterr()
+    assert photos(out, "--up", "0,0,1") == 0
+    assert steps_of(capsys.readouterr().out) == ["convert", "render"]
+    assert (out / "scene.html").read_bytes() != page and (out / "film.gif").read_bytes() != film
+    for recorded in (load_up(out / "run"), read_up(out / "scene")):
+        np.testing.assert_array_equal(recorded.direction, [0, 0, 1])
+    for same in ((), ("--up", "0,0,2")):
+        assert photos(out, *same) == 0
+        assert steps_of(capsys.readouterr().out) == []
+    page = (out / "scene.html").read_bytes()
+    assert photos(out, "--up", "nobody") == 2
+    assert "--up nobody is neither X,Y,Z nor one of the photographs" in capsys.readouterr().err
+    assert (out / "scene.html").read_bytes() == page and (load_up(out / "run").direction == [0, 0, 1]).all()
+
+
 def test_a_folder_that_is_not_there(tmp_path, capsys):
     assert photos(tmp_path / "out") == 2
     assert "is no folder: give the folder of your photographs" in capsys.readouterr().err
@@ -115,8 +137,13 @@ def test_results_are_named_after_the_folder_or_the_video(name, folder, tmp_path,
         (tmp_path / name).mkdir()
         write_image(tmp_path / name / "a.png", np.zeros((30, 40, 3), np.uint8))
     asked = []
-    monkeypatch.setattr(photos_command, "do", lambda *words: asked.append(words) or 1)
-    assert main(["photos", name, "--downscale", "1"]) == 1
+
+    def refuse(*words):
+        asked.append(words)
+        raise InputError("no cameras")
+
+    monkeypatch.setattr(photos_command, "do", refuse)
+    assert main(["photos", name, "--downscale", "1"]) == 2
     assert asked[0][:4] == ("sfm", Path(name), "--out", Path("splats") / folder / "scene")
 
 
@@ -127,3 +154,28 @@ def test_results_are_named_after_the_folder_or_the_video(name, folder, tmp_path,
 def test_a_size_that_trains_in_minutes(size, factor):
     """From 960 pixels on, the smallest factor after which the longer side has at most 640."""
     assert comfortable_factor(*size) == factor
+
+
+@pytest.mark.parametrize(
+    ("n_views", "options", "recipe"), [(6, (), "adaptive"), (5, ("0",), "adaptive"), (4, ("0",), "3dgs-accel")]
+)
+def test_few_photographs_are_all_trained_on(tmp_path, capsys, monkeypatch, n_views, options, recipe):
+    """Of six one is held out, of five none; four are fewer than adaptive needs."""
+    write_room(tmp_path / "out" / "scene", **(SCENE | {"n_views": n_views - 1}))  # and one more is held out
+    (tmp_path / "photos").mkdir()
+    asked = []
+    real = photos_command.do
+
+    def shortened(*words):
+        asked.append(words)
+        return real(*words, *(("--iterations", "30") if words[0] == "train" else ()))
+
+    monkeypatch.setattr(photos_command, "do", shortened)
+    assert photos(tmp_path / "out") == 0
+    held_out = re.findall("--test-every ([0-9]+)", " ".join(map(str, asked[0])))
+    assert asked[0][0] == "train" and tuple(held_out) == options
+    used = json.loads((tmp_path / "out" / "run" / "config.json").read_text())["recipe"]
+    assert used["name"] == recipe
+    said = f"{n_views} photographs: all are trained on, and none is left to measure"
+    assert (said in capsys.readouterr().err) == bool(options)
+    assert (tmp_path / "out" / "film.gif").exists()

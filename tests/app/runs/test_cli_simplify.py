@@ -13,7 +13,15 @@ from minisplat_ref.app.cli import main
 from minisplat_ref.app.runs import opened_run, simplification
 from minisplat_ref.app.runs.opened_run import N_FOLDS, open_run
 from minisplat_ref.app.runs.progress import PSNR_MAX
-from minisplat_ref.app.runs.rate_distortion import CLOSE, PlySize, Point, next_size, paired_drop, smallest_within
+from minisplat_ref.app.runs.rate_distortion import (
+    CLOSE,
+    PlySize,
+    Point,
+    count_sizes,
+    next_size,
+    paired_drop,
+    smallest_within,
+)
 from minisplat_ref.app.runs.simplification import DEFAULT_DROP, Target, decide, fine_tuning, make_measure
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.extensions.extension import find_recipe
@@ -102,14 +110,27 @@ def test_smallest_within_adds_one_standard_error():
 
 
 def test_search_by_hand():
-    """Down by sqrt(2) to the first size outside the limit, then the geometric mean of it and the next larger one."""
-    assert next_size([], 400, 400, 0.1) == 283
-    assert next_size([point(283, 0.05)], 400, 400, 0.1) == 200
-    points = [point(283, 0.05), point(200, 0.2)]
-    assert next_size(points, 400, 400, 0.1) == round(math.sqrt(200 * 283)) == 238
-    assert next_size([*points, point(238, 0.05, 0.06)], 400, 400, 0.1) == round(math.sqrt(238 * 283)) == 260
-    assert next_size([*points, point(238, 0.2), point(260, 0.1)], 400, 400, 0.1) is None  # 260 / 238 is close
-    assert next_size([point(283, 0.5)], 400, 400, 0.1) == round(math.sqrt(283 * 400))  # nothing is within yet
+    """Down by a tenth, then by the square of x to the first size outside the limit, then the geometric mean."""
+    assert next_size([], 400, 400, 0.1) == 363  # 400 / 1.1
+    # x = log(400 / 363) = 0.0971; a drop of 0.04 reaches 0.1 at 0.0971 sqrt(2.5) = 0.1535, which is 343; that is close
+    assert next_size([point(363, 0.04)], 400, 400, 0.1) == 330  # 363 / 1.1
+    # with 0.01 at 0.0971 sqrt(10) = 0.307
+    assert next_size([point(363, 0.01)], 400, 400, 0.1) == 294
+    assert next_size([point(363, 0.001)], 400, 400, 0.1) == 256  # 363 / sqrt(2) at most
+    points = [point(363, 0.001), point(256, 0.2)]
+    assert next_size(points, 400, 400, 0.1) == round(math.sqrt(256 * 363)) == 305
+    assert next_size([*points, point(305, 0.01, 0.06)], 400, 400, 0.1) == round(math.sqrt(256 * 305)) == 279
+    assert next_size([*points, point(305, 0.01), point(279, 0.2)], 400, 400, 0.1) is None  # 305 / 279 is close
+
+
+def test_a_search_that_can_gain_almost_nothing_ends():
+    """A tenth is too much already; or a drop in proportion leaves no other tenth within the limit."""
+    assert next_size([point(363, 0.11)], 400, 400, 0.1) is None
+    assert next_size([point(363, 0.08, 0.03)], 400, 400, 0.1) is None
+    # 0.0971 / 0.08 * 0.1 = 0.1214: nothing below 354 can be within, of which 363 is 1.03 times as many
+    assert next_size([point(363, 0.08)], 400, 400, 0.1) is None
+    # A standard error does not grow with x: here 0.0971 / 0.02 * 0.1 = 0.4855, so 246 might do.
+    assert next_size([point(363, 0.02, 0.06)], 400, 400, 0.1) == 330
 
 
 def test_search_keeps_to_what_there_is():
@@ -117,6 +138,19 @@ def test_search_keeps_to_what_there_is():
     assert next_size([point(150, 0.5)], 400, 150, 0.1) is None  # of the others there are none to add
     assert next_size([], 2, 2, 0.1) == 1 and next_size([point(1, 0.0)], 2, 2, 0.1) is None
     assert next_size([], 1, 1, 0.1) is None
+
+
+def test_sizes_that_are_left_by_hand():
+    assert count_sizes([], 400, 400, 0.1) == (1, None)
+    assert count_sizes([point(363, 0.0)], 400, 400, 0.1) == (1, None)  # nothing says yet where it ends
+    assert count_sizes([point(363, 0.11)], 400, 400, 0.1) == count_sizes([point(363, 0.08)], 400, 400, 0.1) == (0, 0)
+    # 330 is next. In proportion it loses 0.099; then only 329 could do. If it is not within, 363 is close to it.
+    assert count_sizes([point(363, 0.05)], 400, 400, 0.1) == (1, 1)
+    # With 0.02, 321 is next. In proportion it loses 0.045, 288 0.068, and 261 0.088, below which only 246 could do; if
+    # 261 is not within, 274 is between it and 288. These are four; where 321 or 288 are outside, two or three.
+    assert count_sizes([point(363, 0.02)], 400, 400, 0.1) == (1, 4)
+    # Outside the limit 256 leaves 305 and one of 279 and 333; the latter are close to their neighbours.
+    assert count_sizes([point(363, 0.001), point(256, 0.2)], 400, 400, 0.1) == (1, 2)
 
 
 @pytest.mark.parametrize("slope", [0.01, 0.1, 1.0, 30.0])

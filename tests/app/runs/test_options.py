@@ -39,6 +39,7 @@ GIVEN = {
     "model": "sparse/1",
     "background": "255,0,51",
     "block": "/blocks/0-0.json",
+    "whole_iterations": "280",
     "fold": "2",
 }
 """A word for each option that is not its default; None for an option without a value."""
