@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from minisplat_ref.rendering.backends import CPU, REFERENCE, Backend, get_backend
     from minisplat_ref.types import Camera, Gaussians, RenderOutput, Scene, View
 
-__version__ = "0.2.0"  # stated here; pyproject.toml reads it, so that a checkout that is not installed knows it, too
+__version__ = "0.3.0"  # stated here; pyproject.toml reads it, so that a checkout that is not installed knows it, too
 
 _MODULES = {
     "minisplat_ref.rendering.backends": ("CPU", "REFERENCE", "Backend", "get_backend"),

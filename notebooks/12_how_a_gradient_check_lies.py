@@ -128,7 +128,7 @@ print(f"{len(np.unique(wide_hits)) - 1} changes of the hit count on the way; the
 # Gaussians are in which list, which hits are blended or clamped, which slopes the Jacobian clamps. A stencil whose
 # points disagree is refused, and a smaller step is tried.
 
-# %%
+# %% tags=["rounding"]
 near = moved(jump_at - 3e-6)
 near_setting = setting._replace(gaussians=setting.gaussians._replace(means=near[0]))
 true_slope = float(render_stage(REFERENCE, near_setting).vjp(*weights)[0][MOVED, 0])

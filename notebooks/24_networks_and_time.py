@@ -138,7 +138,7 @@ _ = figure
 
 # %% [markdown]
 # What the loss cannot see is the motion along the rays: a still camera shows a body that grows as it shows one that
-# comes nearer. [FAMILY.md](../docs/FAMILY.md#lucas-kanade-lucas-kanade) has the figures; in space, the paths are no
+# comes nearer. [The page of Lucas-Kanade](../docs/family/lucas-kanade.md) has the figures; in space, the paths are no
 # better.
 #
 # ## Play

@@ -151,10 +151,10 @@ print(", ".join(f"{name}: distance of features {distance:.4f}" for name, distanc
 _ = figure
 
 # %% [markdown]
-# [FAMILY.md](../docs/FAMILY.md) has the figures with three seeds, the unfavourable ones first: splitting does not help
-# every pattern, and a bank of edges and stripes copies patterns; it does not understand brush strokes. Even here it is
-# not certain: another processor rounds differently, so other Gaussians are split, and with the same seed the distance
-# was 0.075 on one and 0.100 on another, where colours alone have 0.084.
+# [The page of G-Style](../docs/family/style.md) has the figures with three seeds, the unfavourable ones first:
+# splitting does not help every pattern, and a bank of edges and stripes copies patterns; it does not understand brush
+# strokes. Even here it is not certain: another processor rounds differently, so other Gaussians are split, and with the
+# same seed the distance was 0.075 on one and 0.100 on another, where colours alone have 0.084.
 #
 # ## Play
 #

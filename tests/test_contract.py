@@ -18,7 +18,7 @@ MODULES = [module.name for module in iter_modules(reference.__path__)]
 STAGES = [
     field.name
     for field in fields(Backend)
-    if field.name not in ("name", "is_compiled", "tile_width", "tile_height", "residence")
+    if field.name not in ("name", "is_compiled", "tile_width", "tile_height", "residence", "is_deterministic")
 ]
 
 # Modules of cpu without a twin of their name: what several stages use. A stage of several files is a folder, and its

@@ -204,7 +204,7 @@ class StraightLines:
         )
         self.colors, self.background = np.tile(color, (n, 1)), np.zeros(3)
         self.bins = REFERENCE.bin_gaussians(self.projection, grid, GSPLAT_MAIN)
-        self.frame = pack_frame(self.bins, GSPLAT_MAIN, np.dtype(f32))
+        self.frame = pack_frame(self.bins.grid, GSPLAT_MAIN, np.dtype(f32))
         self.expected = REFERENCE.composite(self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN)
         self.v_image = np.random.default_rng(2).normal(size=self.expected.image.shape).astype(f32)
         self.drawn = np.zeros((n_copies, N_ROWS, DRAWN_FIELDS, WIDTH), f32)

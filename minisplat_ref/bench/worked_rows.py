@@ -55,5 +55,5 @@ def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-d
 def count_worked_rows(projection: Projection, channels: Floats, bins: TileBins) -> int:
     """Return the number of rows of eight pixels that the blending kernels compute, over all Gaussians and tiles."""
     records = records_of(projection, channels, GSPLAT_MAIN)
-    frame = pack_frame(bins, GSPLAT_MAIN, records.dtype)
+    frame = pack_frame(bins.grid, GSPLAT_MAIN, records.dtype)
     return int(_count_rows(records, bins.gaussian_ids, bins.tile_offsets, frame))

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 from minisplat_ref.extensions import folders
+from minisplat_ref.extensions.extension import load_extension
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -42,12 +43,28 @@ def test_layers_are_those_of_the_import_check():
     assert shown == [re.findall(r"\w+", row) for row in rows if row != "__main__"]
 
 
-def test_every_extension_has_a_row_and_a_section_of_the_family():
-    page = (ROOT / "docs" / "FAMILY.md").read_text(encoding="utf-8")
-    sections = re.findall(r"^## .*\(`([\w-]+)`\)$", page, re.MULTILINE)
-    rows = [line.split("|")[1:-1] for line in page.splitlines() if line.startswith("| [")]
-    assert sorted(sections) == sorted(folders())
-    for name, (system, _, idea, _) in zip(sections, rows, strict=True):
-        assert system.strip().endswith(f"-{name})") and len(idea.split()) <= 12
-        text = page.partition(f"(`{name}`)\n")[2].partition("\n## ")[0]
-        assert all(f"- **{word}.**" in text for word in ("Measured", "Difference")) or "**Claim.**" not in text
+def rows_of_the_family():
+    table = (ROOT / "docs" / "FAMILY.md").read_text(encoding="utf-8")
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if line.startswith("| [")]
+
+
+def test_every_extension_has_a_row_and_a_page_of_the_family():
+    rows = rows_of_the_family()
+    assert sorted(row[2].strip("`") for row in rows) == sorted(folders())
+    assert len(list((ROOT / "docs" / "family").iterdir())) == len(rows)
+    for relative, idea, extension, recipes, _, notebook in rows:
+        name = extension.strip("`")
+        assert relative.endswith(f"](family/{name}.md)") and len(idea.split()) <= 12
+        assert recipes == ", ".join(f"`{recipe.name}`" for recipe in load_extension(name).recipes)
+        page = (ROOT / "docs" / "family" / f"{name}.md").read_text(encoding="utf-8")
+        assert page.partition("\n")[0].endswith(f" ({extension})")
+        assert f"[notebook {notebook}](" in page or not notebook
+        assert all(f"- **{word}.**" in page for word in ("Measured", "Difference")) or "**Claim.**" not in page
+
+
+def test_headline_figures_of_the_family_are_on_its_pages():
+    for _, _, extension, _, headline, _ in rows_of_the_family():
+        page = (ROOT / "docs" / "family" / f"{extension.strip('`')}.md").read_text(encoding="utf-8")
+        named = re.sub("`[^`]*`", "", headline)  # but for those in names, such as `3dgs-accel`
+        figures = set(re.findall(r"[\d.,]*\d(?:e-\d+)?", named))
+        assert figures and figures <= set(re.findall(r"[\d.,]*\d(?:e-\d+)?", page))

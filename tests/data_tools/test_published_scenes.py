@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_tools import published_scenes
-from data_tools.published_scenes import ROWS, SPARSE_VIEWS, cells, main, thin_out
+from data_tools.published_scenes import ROWS, SPARSE_VIEWS, cells, main, shortened, thin_out
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, write_image
 
@@ -54,6 +54,13 @@ def test_cells_by_hand():
     expected = ["lego-3dgs", "30,000", "35.78", "35.00", "-0.78", "0.9800", "300,000", "5,400"]
     assert cells("lego-3dgs", metrics) == expected
     assert cells("lego-adaptive", metrics)[2:5] == ["-", "35.00", "-"]
+
+
+def test_a_part_of_the_iterations():
+    """Of 30,000 iterations that are measured every 7,000, a tenth is 3,000, every 700; other numbers stay."""
+    options = shortened(ROWS["lego-3dgs"].options, 10)
+    assert options[options.index("--iterations") + 1] == "3000" and options[options.index("--eval-every") + 1] == "700"
+    assert "255,255,255" in options and shortened(ROWS["lego-adaptive"].options, 10) == [*ROWS["lego-adaptive"].options]
 
 
 def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):

@@ -9,7 +9,7 @@ the integral over the square, in closed form, without a low-pass (:mod:`minispla
 with the offset u along the footprint's axes and its standard deviations l. F is the normal distribution function or, in
 the recipe as in the paper, ``1 / (1 + exp(-(1.6 x + 0.07 x^3)))``, which needs no error function. With the former the
 integral is exact where the axes are the image's. Elsewhere the square is rotated along with them, so needles at an
-angle have an error, which ``claims analytic/footprint`` measures (``docs/FAMILY.md`` has the figures).
+angle have an error, which ``claims analytic/footprint`` measures (``docs/family/analytic.md`` has the figures).
 
 The integral is a response (:class:`minisplat_ref.reference.hits.Response`); the rest of the renderer is that of 3DGS,
 on the plain kernels or the reference. Only the reference collects blend statistics.

@@ -18,7 +18,7 @@ Resets lower the opacities that are seen through the filter in space. The filter
 camera's image and 15 % around it, as in the released code, and a new Gaussian has its parent's filter until it is
 measured. A recipe of the core that is trained with
 ``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a Gaussian
-over a pixel, is the extension ``analytic``; ``docs/FAMILY.md`` has the figures of both.
+over a pixel, is the extension ``analytic``; ``docs/family/`` has the figures of both.
 
 A viewer of 3DGS has neither filter. ``fuse`` (:mod:`minisplat_ref.extensions.antialiasing.fuse`) writes s' and o'
 instead of s and o, a PLY of six fields.

@@ -22,7 +22,8 @@ renders these six in another way is recorded in the header. Other programs' form
 :mod:`minisplat_ref.io.formats`.
 
 Left out are pruning, merging and training with the quantiser in the loop, which gain more than any entropy coder;
-vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.md`` has the measured figures.
+vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/family/compression.md`` has the measured
+figures.
 """
 
 from minisplat_ref.extensions.compression.msz import MSZ

@@ -29,8 +29,8 @@ With ``growth_threshold=none`` they do not grow.
 
 ``features=DIR`` has a map for each photograph, ``NAME.npy`` or ``NAME.npz`` of [h, w, D], of whatever network; without
 it maps are classical: colours and the energies of Gabor filters at three scales, 22 numbers.
-``docs/FAMILY.md`` has the measured figures. A run keeps networks, embeddings and memory in ``shared.npz``; a PLY has
-the anchors, which other viewers show as one Gaussian each.
+``docs/family/cus.md`` has the measured figures. A run keeps networks, embeddings and memory in ``shared.npz``; a PLY
+has the anchors, which other viewers show as one Gaussian each.
 
 This deviates from the paper as follows. Its features are those of foundation models; ours are given or classical,
 without any claim about meaning. Networks add to the initial values of an anchor, such as the colour of its points;

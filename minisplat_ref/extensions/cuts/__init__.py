@@ -17,7 +17,7 @@ so the saved and evaluated model has hard edges. ``widths`` is a column of the P
     python -m data_tools.claims cuts/edge SCENE --out DIR
     minisplat-ref oracle gradients --extension cuts
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/cuts.md`` has the measured figures.
 
 This deviates from the paper, which keeps the step and replaces its gradient by an approximation. Control points are in
 standard deviations instead of world units, and follow the affine map that projects the Gaussian, so that its cuts

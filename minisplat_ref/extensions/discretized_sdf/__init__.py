@@ -25,7 +25,7 @@ environment's light, so that all of it can be lit anew. The background is random
     python -m data_tools.claims discretized-sdf/relight --out DIR
     minisplat-ref oracle gradients --extension discretized-sdf
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/discretized-sdf.md`` has the measured figures.
 
 The PLY has the distances, and as ``opacity`` the opacities that follow from them, for other viewers; gamma is in
 ``shared.npz`` beside it, as ln(1 / gamma), the environment likewise. Clones and children of a split inherit s, which a
@@ -34,11 +34,11 @@ tangent plane does not change; faint surfels are pruned by their opacity, and a 
 Dates, rates and the start are those of the released code, weights those of its script for shiny objects. Lengths are in
 world units, and meant for an object of about one. This deviates from the code as follows. The distortion has the
 default of the code, 100, where its scripts have 2,000 for objects before nothing; in a room even 100 costs much
-(``docs/FAMILY.md``). Its sphere, which is an option there, too, is around the points and in their size, instead of the
-origin; ``foreground`` is the share of the points that it takes the place of. gamma is trained as its logarithm. A reset
-raises |s| on both sides of the surface, there on one. Surfels face at random, and the albedo begins with their colours.
-The inverse of D is interpolated. A mask of the scene is taken for the object's: where it hides something else, train
-with ``--set silhouette=0``. With another recipe, density control sees the first opacities.
+(``docs/family/discretized-sdf.md``). Its sphere, which is an option there, too, is around the points and in their size,
+instead of the origin; ``foreground`` is the share of the points that it takes the place of. gamma is trained as its
+logarithm. A reset raises |s| on both sides of the surface, there on one. Surfels face at random, and the albedo begins
+with their colours. The inverse of D is interpolated. A mask of the scene is taken for the object's: where it hides
+something else, train with ``--set silhouette=0``. With another recipe, density control sees the first opacities.
 """
 
 from minisplat_ref.extensions.discretized_sdf.model import DISTANCED, stages

@@ -19,7 +19,7 @@ gradients, so that the position, colour and opacity of each vertex can be traine
     minisplat-ref bench --extension fans
     minisplat-ref oracle gradients --extension fans
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/fans.md`` has the measured figures.
 
 This deviates from the paper as follows. Colours and opacities are clipped to [0, 1] after every step, so that a file
 holds the values that are rendered. Fans are pruned whole, by their most opaque vertex; single triangles are left out

@@ -11,7 +11,7 @@ are those of the face (:mod:`.model` has the equations). Whatever moves the corn
     python -m data_tools.claims games/counts room --out DIR
     minisplat-ref oracle gradients --extension games
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/games.md`` has the measured figures.
 
 The PLY is one of 3DGS, with means, rotations and scales as they follow; its further columns, which other viewers skip,
 continue a training. No Gaussian is cloned, split or pruned, and opacities are not reset.

@@ -21,7 +21,7 @@ place: a ball of K = 10,000 Gaussians on a Fibonacci lattice, white at first, or
     python -m data_tools.claims gaustudio/swaps SCENE --out DIR
     minisplat-ref oracle gradients --extension gaustudio
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/gaustudio.md`` has the measured figures.
 
 This deviates from the code as follows. The ball has a radius of 100 extents there and its Gaussians may move; here it
 is around each camera, infinitely far, its Gaussians are round, and they stay in their directions. They have no part in

@@ -18,11 +18,12 @@ repulsive one, ``sum exp(-|x_i - x_j|^2 / 2 h^2)``, which disperses them as inte
     python -m data_tools.claims gdgs/counts SCENE --out DIR
     minisplat-ref oracle gradients --extension gdgs
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/gdgs.md`` has the measured figures.
 
 This deviates from the paper as follows. The surface is that of local planes of 12 points instead of a mesh. The paper
 gives neither the weights nor the size of regions: the weights, and 5 regions along the longest side, are ours, and no
-photographs were used to choose them. Of a region with more than 2,048 Gaussians a part is dispersed. Until 10,000
+photographs were used to choose them. The predictor, trained on the points alone, moves more than half of them by more
+than the distance of two neighbours. Of a region with more than 2,048 Gaussians a part is dispersed. Until 10,000
 Gaussians are densified as in 3DGS, and from then on only cloned. The sum over neighbours is over their mean, which has
 the same gradient up to a factor. Losses act every 100 iterations of a training of any length. Left out is the pruning
 by regions, of which we know no rule.

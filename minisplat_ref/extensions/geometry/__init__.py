@@ -16,7 +16,7 @@ All are functions of the expected depth ``sum w z / alpha``, so their gradient g
     python -m data_tools.claims geometry/depth room --out DIR
     minisplat-ref oracle gradients --extension geometry
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/geometry.md`` has the measured figures.
 """
 
 from minisplat_ref.extensions.extension import Extension

@@ -20,7 +20,7 @@ take the place of cloning, splitting, pruning and the reset of opacities:
   so be relocated. Gaussians start with the opacity 0.5 and a tenth of the size that 3DGS gives them.
 
 ``--set`` reaches ``noise`` (a), ``dead_opacity``, ``growth``, ``budget``, ``per_pixel``, ``opacity_reg``,
-``scale_reg``, ``initial_opacity`` and ``initial_size``. ``docs/FAMILY.md`` has the measured figures.
+``scale_reg``, ``initial_opacity`` and ``initial_size``. ``docs/family/mcmc.md`` has the measured figures.
 
 This deviates from the release as follows. It asks for the cap, which in the paper is the number that 3DGS ends with;
 without a ``--budget`` it is here 0.03 for each pixel of the training views, where those of the release are between

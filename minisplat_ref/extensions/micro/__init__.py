@@ -17,7 +17,7 @@ an edge in one place is wrong next to it. There are three changes to 3DGS
 extents of the scene), ``beta``, ``score_mass``, ``merge_reach`` and ``merge_color``. With ``trace=0``, ``beta=0``,
 ``score_mass=1`` and ``merge_reach=0`` the method is ``3dgs-accel``, bit for bit.
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/micro.md`` has the measured figures.
 
 This deviates from the paper as follows. The paper sums P_k = max(tr(Sigma_k) - tau, 0); here the P_k are averaged and
 measured in units of tau, so that lambda depends neither on the scene's unit nor on the number of Gaussians. Lambda,

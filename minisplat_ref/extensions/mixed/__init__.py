@@ -26,7 +26,7 @@ It reconstructs surfaces, so the recipe has the losses of 2D Gaussian Splatting 
     python -m data_tools.claims mixed/scene SCENE room --iterations 300 --out DIR
     minisplat-ref oracle gradients --extension mixed
 
-:mod:`data_tools.claims.mixed.fit` fits an image with a few primitives of one kind. ``docs/FAMILY.md`` has the
+:mod:`data_tools.claims.mixed.fit` fits an image with a few primitives of one kind. ``docs/family/mixed.md`` has the
 measured figures.
 
 Built of the paper: the three primitives and their response, groups of points at the start, the loss of vertices, the

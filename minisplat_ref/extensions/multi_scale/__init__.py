@@ -15,7 +15,7 @@ for a large image. Here a scene has several levels, and a view renders at each p
 The sides w and w' are a further field, ``cells``, and columns of the PLY. A population of level 0 alone is 3DGS, bit
 for bit.
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/multi-scale.md`` has the measured figures.
 
 This deviates from the paper, which drops every Gaussian by its own coverage, within bounds that follow the training;
 there the members of a cube disappear at other distances than their parent appears, and training has to compensate for

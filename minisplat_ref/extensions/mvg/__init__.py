@@ -20,7 +20,7 @@ the photometric one (:mod:`.recipe`):
     python -m data_tools.claims mvg/insertion staircase --out DIR
     minisplat-ref oracle gradients --extension mvg
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/mvg.md`` has the measured figures.
 
 This deviates from the paper as follows. The dates, the weights, the strides, the filter's widths and how the cuts adapt
 are ours, since no released value was found. Points that an older Gaussian covers are left out, because each view would

@@ -25,7 +25,7 @@ Four consequences are worth knowing:
   change its sign, stays. That colour has a gradient, which 3DGS loses at zero.
 - The PLY is that of 3DGS, with ``f_dc`` below -1.77 where the colour is negative. Other programs read it and clamp.
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/negative.md`` has the measured figures.
 
 How the released code chooses its negative components, and with which colours they start, was not known to us. Here they
 are sampled at random, and a sampled Gaussian starts with its colour negated. A density for each pair is left out; the

@@ -18,9 +18,11 @@ of one or two numbers, each part is an index into a separate codebook (:mod:`.co
     minisplat-ref convert runs/other fitted.omg
     python -m data_tools.claims omg/distinctiveness room --out DIR
     python -m data_tools.claims omg/files room --out DIR
+    python -m data_tools.claims omg/networks room --out DIR
 
 The output of networks and codes is written into the six fields of 3DGS in every iteration, so every viewer can show
-``point_cloud.ply`` and every format can hold it. ``docs/FAMILY.md`` has the measured figures.
+``point_cloud.ply`` and every format can hold it. ``omg pack`` needs zstandard (the extra ``compression``), the training
+does not. ``docs/family/omg.md`` has the measured figures.
 
 Choices of ours where the paper is silent: the networks begin with the outputs that the Gaussians had; their
 learning rates; that their gradient does not reach the centres; the radius in which the scene is not contracted; and

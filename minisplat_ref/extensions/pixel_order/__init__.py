@@ -14,7 +14,7 @@ that also trains:
 Both depend on rays alone, and so do culling by distance and the low-pass, so a camera that turns sees the same colours
 up to rounding. Sorting does not remove every jump: where two Gaussians interpenetrate, two hits of a pixel change
 places as the camera *moves*, pixel by pixel instead of all at once. ``claims pixel-order/rotation`` measures both, and
-``docs/FAMILY.md`` has the figures.
+``docs/family/pixel-order.md`` has the figures.
 
 This deviates from StopThePop, which sorts in a hierarchy of queues for tiles, blocks and pixels; here each pixel has
 one queue over a list by distance. Its minimum thickness of 0.001 world units is a thousandth of the longest axis here.

@@ -28,7 +28,7 @@ The edge of a polygon has no gradient; it cuts less than 0.008 of alpha. There i
 pixel fall between rays. A polygon in a plane with the camera is not seen. Of polygons that lie in one
 plane, copies are taken in the order of their rows, and others in the order in which rounding puts their depths.
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/polygons.md`` has the measured figures.
 
     minisplat-ref train SCENE --recipe polygons
     minisplat-ref polygons export runs/fox --out soup.ply

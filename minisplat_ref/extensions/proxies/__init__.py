@@ -14,7 +14,7 @@ There are three ways to change a trained scene without training it again.
 
 :mod:`.binding` lists the deviations from GaMeS: any Gaussians are bound, and the whole of F acts on them. The
 extension ``games`` trains them on the faces. Left out are collisions of a sheet with itself, solids, and relighting of
-rotated parts. ``docs/FAMILY.md`` has the measured figures.
+rotated parts. ``docs/family/proxies.md`` has the measured figures.
 
     minisplat-ref proxies edit runs/fox out.ply --sphere 0 0 2 0.5 --rotate 0 30 0
     minisplat-ref proxies cage runs/banana sheet.ply --cells 20

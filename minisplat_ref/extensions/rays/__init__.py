@@ -20,7 +20,7 @@ eye. Density control, which needs gradients in the image, gets them from those i
 one.
 
 There is no low-pass: Gaussians thinner than a pixel fall between rays, and images smaller than those of the training
-alias. Shadows, mirrors and glass have no gradient. ``docs/FAMILY.md`` has the measured figures.
+alias. Shadows, mirrors and glass have no gradient. ``docs/family/rays.md`` has the measured figures.
 
     minisplat-ref train SCENE --recipe rays
     minisplat-ref rays render runs/fox --scene lamp_and_mirror.json --out DIR

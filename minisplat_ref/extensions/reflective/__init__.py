@@ -27,7 +27,7 @@ grow by half, and once pixels are shaded the colours of others are disturbed, so
     python -m data_tools.claims reflective/mirrors --out DIR
     minisplat-ref oracle gradients --extension reflective
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/reflective.md`` has the measured figures.
 
 Dates, rates and thresholds are those of the released code. This deviates from it as follows. Reflected rays meet the
 surfels, not a mesh that is extracted now and then, and V is their transmittance. The environment has 32 x 64 texels

@@ -21,7 +21,7 @@ surface model is the altitude that a camera in the zenith renders.
     python -m data_tools.claims satellite/distance --out DIR
     minisplat-ref oracle gradients --extension satellite
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/satellite.md`` has the measured figures.
 
 This deviates from the paper as follows. Altitudes are divided by alpha; where almost nothing is, alpha counts as 0.05.
 The exponent 0.4, the limit 0.3 and the shear's 0.01 are per metre. The nearly transparent start and the random

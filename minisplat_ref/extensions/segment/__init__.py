@@ -15,7 +15,7 @@ program may have made; nothing that was learned is downloaded.
     minisplat-ref segment render labelled.ply --cameras runs/fox/cameras.json --out labels
     python -m data_tools.claims segment/masks --out DIR
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/segment.md`` has the measured figures.
 
 It works for every recipe whose renderer blends the colours of its primitives once. Where the weights do not add up to
 the opacity of the image, the command reports it; parameters that no PLY holds, such as networks that change opacities,

@@ -21,7 +21,7 @@ The features F are those of a classical bank of filters, or of a network with we
     python -m data_tools.claims style/swatches --out DIR
     minisplat-ref oracle gradients --extension style
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/style.md`` has the measured figures.
 
 This deviates from the paper as follows. Without VGG16 the features are edges, stripes and colours: patterns are copied,
 brush strokes are not understood; the content's weight is ours there. Children lie on a grid that keeps the parent's

@@ -20,7 +20,7 @@ the published dates (:mod:`minisplat_ref.mechanisms.surfels.losses`):
     minisplat-ref oracle gradients --extension surfels
     minisplat-ref oracle compare my_module:rasterization_2dgs --call rasterization_2dgs
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/surfels.md`` has the measured figures.
 
 This deviates from the released code as follows. A surfel reaches as far as its alpha can be 1/255 instead of three
 standard deviations. Where the low-pass is hit, the depth is that of the centre, not that at which the ray meets the

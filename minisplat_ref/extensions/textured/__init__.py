@@ -17,7 +17,7 @@ textures of degree 0 the method is 3DGS, to the last byte.
     python -m data_tools.claims textured/limb
     minisplat-ref oracle gradients --extension textured
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/textured.md`` has the measured figures.
 
 This deviates from the paper as follows. The ellipsoid is exactly that of one standard deviation; the released kernel
 divides by standard deviations where their squares belong. Most rays that a footprint reaches miss the ellipsoid. In the

@@ -23,7 +23,9 @@ Gaussians are those of 3DGS with y = 0. ``vdgs bake`` writes the Gaussians of on
 This deviates from the paper as follows. The factor is 1 + y instead of y, and the last layer starts at 0, so that a
 training begins as 3DGS and without an output is 3DGS exactly. An opacity is kept between 1e-4 and 0.99; one above 0.99
 is not raised further. Space is contracted into the unit cube. Hash grid and network are small, for a CPU: 4 levels of
-4,096 rows with two features, 32 hidden units, and the learning rates are ours.
+4,096 rows with two features, 32 hidden units, and the learning rates are ours. An earlier commit of the released code
+(0d092d4) has no hash encoding: its network reads the Gaussian's own opacity beside d, and its output is the opacity.
+That is left out; ``claims vdgs/floats`` has an arm whose network reads the direction alone.
 """
 
 from pathlib import Path

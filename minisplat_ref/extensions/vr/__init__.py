@@ -15,7 +15,7 @@ of Gaussians; ``vr`` is Mini-Splatting2 with them from the start.
     python -m data_tools.claims vr/queues --ply runs/vr/point_cloud.ply --out DIR
     python -m data_tools.claims vr/yaw --ply runs/vr/point_cloud.ply --out DIR
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/vr.md`` has the measured figures.
 
 This deviates from the paper. One buffer of 16 hits replaces StopThePop's queues of tiles, blocks and pixels, with which
 :mod:`data_tools.claims.vr.queues` compares it. We did not find figures of the paper's rates by eccentricity;

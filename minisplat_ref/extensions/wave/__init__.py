@@ -20,7 +20,7 @@ that shows phases alone gets the double-phase encoding (:mod:`.focus`).
     python -m data_tools.claims wave/scene runs/fox/point_cloud.ply --out DIR
     minisplat-ref oracle gradients --extension wave
 
-``docs/FAMILY.md`` has the measured figures.
+``docs/family/wave.md`` has the measured figures.
 
 Any run will do: surfels are flat; other Gaussians lose their thinnest axis, and the number of those that were no discs
 is reported. The camera's view is placed in a box of the display's size without perspective, as behind an eyepiece
@@ -28,9 +28,10 @@ is reported. The camera's view is placed in a box of the display's size without 
 focus the absolute values of the field are the rendered image.
 
 This deviates from the paper as follows. Exact blending of a whole scene is done in windows and 64 planes
-(:mod:`.blending`); without them it takes two transforms of the grid for each Gaussian. The fast approximation has one
-transmittance for each Gaussian, at its centre, instead of none. Slopes are bounded, because a Gaussian that is steeper
-than its own light would shine along its mirrored direction as well. The low-pass is that of 3DGS, for surfels too.
+(:mod:`.blending`), one Gaussian after another in NumPy; without them it takes two transforms of the grid for each
+Gaussian. Only the sum of the fast approximation has a kernel. That approximation has one transmittance for each
+Gaussian, at its centre, instead of none. Slopes are bounded, because a Gaussian that is steeper than its own light
+would shine along its mirrored direction as well. The low-pass is that of 3DGS, for surfels too.
 
 Left out: training on holograms, random phases (they blur parts out of focus more, with speckle), and the paper's
 comparison by photographs of a display. There is nothing to train, so the gradients are those of the closed form.
