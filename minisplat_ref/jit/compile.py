@@ -13,6 +13,8 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
   kernels that different processes compiled for different numbers of channels can contain different functions under one
   name, and a process that loads both runs one of them twice. Therefore a function's name here includes what it closes
   over: functions by module and name, bundles of them field by field, numbers by type and value, nothing by its address.
+  Numba's index of a kernel goes by that name, too, in place of a pickle of what it closes over, which is not the same
+  in all processes: of 383 kernels that the test suite compiled, 65 had been compiled before.
 * Two processes that save to Numba's cache at the same moment take the same file name, and later processes load the
   wrong kernel. Saving is therefore one process at a time. So is compiling one kernel, which takes seconds: processes
   that need the same wait for the first and load what it saved.
@@ -252,6 +254,12 @@ def _share_work(compiled: Any, folder: str) -> None:
     compiled._cache.save_overload = save_overload
 
 
+def _index_by_name(compiled: Any, name: str) -> None:
+    """Have the cache find a kernel by its signature, its own bytecode and a name that includes what it closes over."""
+    own = hashlib.sha256(compiled.py_func.__code__.co_code).hexdigest()
+    compiled._cache._index_key = lambda signature, codegen: (signature, codegen.magic_tuple(), (own, name))
+
+
 def scalar(function: Callable) -> Callable:
     """Mark a formula of one Gaussian or one pixel that kernels call; in Python the function stays itself."""
     # Always inlined: a call would count references to every array argument, an atomic operation each. Nothing calls it
@@ -326,6 +334,7 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
         if folder is not None and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # then it is plain Python
+            _index_by_name(compiled, function.__qualname__)
             _share_work(compiled, folder)
 
         @functools.wraps(function)

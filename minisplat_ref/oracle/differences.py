@@ -27,7 +27,7 @@ STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 """Steps to try: the first is best for values of order 1, the next are used only where the one before is refused."""
 
 
-SETTLED = 1e-6
+SETTLED = 1e-9
 """Relative difference of the derivatives from two steps, ten times apart, below which neither has met a threshold."""
 ROUNDINGS = 30.0
 """Units in the last place by which a value may be off that sums hundreds of terms."""

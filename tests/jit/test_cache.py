@@ -109,6 +109,29 @@ def test_kernels_are_hashed_with_the_mechanisms_that_they_may_call(tmp_path, mon
     assert _jit._folder_of_module(module) != before
 
 
+def times(factor, note):
+    @_jit.scalar
+    def product(x):
+        return factor * x
+
+    product.note = note  # part of its pickle, and not of what is computed
+
+    @_jit.kernel(parallel=False)
+    def multiply(x):
+        for i in range(len(x)):
+            x[i] = product(x[i])
+
+    return multiply
+
+
+def test_a_kernel_is_found_by_what_it_closes_over_and_not_by_its_pickle(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for factor, note, n_kernels in ((3.0, "one process", 1), (3.0, "another", 1), (4.0, "another", 2)):
+        x = np.ones(2)
+        times(factor, note)(x)
+        assert x.tolist() == [factor, factor] and len(files(tmp_path, ".nbc")) == n_kernels
+
+
 def test_kernels_of_mechanisms_are_kept_together():
     function = import_module("minisplat_ref.mechanisms.rays.bvh").widest_axis
     assert _jit._modules_of(function) == {"minisplat_ref.mechanisms"}

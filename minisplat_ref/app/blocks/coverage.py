@@ -13,6 +13,7 @@ from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.types import Bools, Floats, Frame, Ints, Model, Scene, View
 
 SHARE_MIN = 0.25  # of the pixels, from which on a photograph belongs to a block: VastGaussian's
+REST_MAX = 0.02  # of the pixels that show the scene, which a photograph may leave without a block; ours
 TRAIN_VIEWS_MIN = 2  # photographs without which nothing can be trained
 
 
@@ -56,7 +57,7 @@ def cover(coarse: Coarse, scene: Scene, plane: Plane, blocks: Sequence[Block]) -
     Raises
     ------
     InputError
-        A block has fewer than two photographs.
+        Fewer than two photographs belong to a block.
     """
     coordinates = plane.coordinates(coarse.means)  # [N, 2]
     in_region = np.stack([block.region.contains(coordinates) for block in blocks])  # [B, N]
@@ -65,20 +66,40 @@ def cover(coarse: Coarse, scene: Scene, plane: Plane, blocks: Sequence[Block]) -
     for view in scene.train_views:
         ids = _dominant(coarse, view)  # [H, W]
         is_shown = ids >= 0
-        is_trained = np.zeros_like(is_shown)
-        for own, inside in zip(masks, in_region, strict=True):
-            mask = shows(ids, inside)
-            if mask.mean() >= SHARE_MIN:
-                own[view.name] = mask | ~is_shown
-                is_trained |= mask
-        n_trained, n_shown = n_trained + int(is_trained.sum()), n_shown + int(is_shown.sum())
+        shown = np.stack([shows(ids, inside) for inside in in_region])  # [B, H, W]
+        chosen = choose_blocks(shown)
+        for b in chosen:
+            masks[b][view.name] = shown[b] | ~is_shown
+        n_trained, n_shown = n_trained + int(shown[chosen].any(axis=0).sum()), n_shown + int(is_shown.sum())
     for block, own in zip(blocks, masks, strict=True):
         if len(own) < TRAIN_VIEWS_MIN:
             raise InputError(
-                f"block {block.name} has {len(own)} photographs of which {SHARE_MIN:.0%} show it, and training needs"
-                f" {TRAIN_VIEWS_MIN}: give fewer blocks, or more photographs there"
+                f"block {block.name} has {len(own)} photographs that show it, and training needs {TRAIN_VIEWS_MIN}:"
+                " give fewer blocks, or more photographs there"
             )
     return Coverage(masks, n_trained / max(n_shown, 1))
+
+
+def choose_blocks(shown: Bools) -> list[int]:
+    """Return the blocks to which a photograph belongs: those that a quarter of its pixels show, and others as needed.
+
+    Of many small blocks few fill a quarter of a photograph. The others follow, each time the one that most of the
+    pixels without a block show, until these are a fiftieth of those that show any.
+
+    Parameters
+    ----------
+    shown : ndarray of shape (B, H, W), bool
+        Whether a pixel shows a block's region.
+    """
+    n_pixels = shown[0].size
+    chosen = [int(b) for b in np.flatnonzero(shown.sum(axis=(1, 2)) >= SHARE_MIN * n_pixels)]
+    rest = shown.any(axis=0)
+    rest_max = REST_MAX * rest.sum()
+    rest &= ~shown[chosen].any(axis=0)
+    while rest.sum() > rest_max:
+        chosen.append(int((shown & rest).sum(axis=(1, 2)).argmax()))
+        rest &= ~shown[chosen[-1]]
+    return chosen
 
 
 def shows(ids: Ints, inside: Floats | Bools) -> Bools:

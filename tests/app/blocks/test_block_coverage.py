@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref.app.blocks import coverage as coverage_module
-from minisplat_ref.app.blocks.coverage import SHARE_MIN, Coarse, cover, shows
+from minisplat_ref.app.blocks.coverage import Coarse, choose_blocks, cover, shows
 from minisplat_ref.app.blocks.grid import Block
 from minisplat_ref.app.runs.scene_part import Box, Plane
 from minisplat_ref.errors import InputError
@@ -41,27 +41,49 @@ def test_shows_is_no_block_where_there_is_no_gaussian():
 
 
 def test_a_photograph_belongs_to_the_blocks_that_it_shows():
-    # From x = 1 the image is of x from 0 to 2: a twentieth shows the left region, which ends at 0.1.
+    # From x = 1 the image is of x from 0 to 2: a twentieth shows the left region, which ends at 0.1, and the right one
+    # shows that, too.
     coverage = cover(screen(), scene_of(looking_at(-1.0), looking_at(0.0), looking_at(1.0)), PLANE, [LEFT, RIGHT])
     assert list(coverage.masks[0]) == ["v0", "v1"] and list(coverage.masks[1]) == ["v1", "v2"]
     assert coverage.trained == 1.0
     columns = coverage.masks[0]["v1"].all(axis=0)  # of 20, each a tenth of a unit wide
     assert columns[:10].all() and not coverage.masks[0]["v1"][:, 13:].any()
-    assert 0.05 < SHARE_MIN < 0.5
 
 
-@pytest.mark.parametrize(("n_columns", "belongs"), [(5, True), (4, False)])
-def test_a_quarter_of_the_pixels_is_enough(n_columns, belongs, monkeypatch):
-    """Of 20 columns five show the left region, or four."""
+def columns(*spans, n=100):
+    """One row of pixels for each block, shown in these columns."""
+    shown = np.zeros((len(spans), 1, n), bool)
+    for row, span in zip(shown, spans, strict=True):
+        row[0, slice(*span)] = True
+    return shown
+
+
+@pytest.mark.parametrize(
+    ("spans", "blocks"),
+    [
+        ([(0, 25), (25, 100)], [0, 1]),  # a quarter
+        ([(0, 24), (24, 100)], [1, 0]),  # less, and nothing else shows it
+        ([(0, 24), (2, 100)], [1]),  # all but 2 of 100 pixels
+        ([(0, 24), (3, 100)], [1, 0]),
+        ([(0, 20), (15, 37), (80, 100), (30, 50)], [1, 2, 0, 3]),  # 22 pixels, 20, then 15 and 13 of 20 that are left
+        ([(0, 50), (50, 51)], [0]),  # of the pixels that show anything, not of all
+        ([(0, 40), (40, 41)], [0, 1]),
+        ([(0, 0), (0, 0)], []),
+    ],
+)
+def test_a_photograph_belongs_to_blocks_that_fill_a_quarter_and_to_those_that_all_but_a_fiftieth_needs(spans, blocks):
+    assert choose_blocks(columns(*spans)) == blocks
+
+
+def test_photographs_go_to_small_blocks_too(monkeypatch):
+    """Of 20 columns four show the left region, and all others the right one."""
     ids = np.zeros((10, 20), int)
-    ids[:, n_columns:] = 1
+    ids[:, 4:] = 1
     monkeypatch.setattr(coverage_module, "_dominant", lambda coarse, view: ids)
     two = screen([[-1.0, 0, 2], [1.0, 0, 2]])
-    masks, _ = cover(two, scene_of(looking_at(0), looking_at(0)), PLANE, [LEFT] if belongs else [RIGHT])
-    assert len(masks[0]) == 2
-    if not belongs:
-        with pytest.raises(InputError, match="block 0-0 has 0 photographs of which 25% show it"):
-            cover(two, scene_of(looking_at(0), looking_at(0)), PLANE, [LEFT])
+    masks, trained = cover(two, scene_of(looking_at(0), looking_at(0)), PLANE, [LEFT, RIGHT])
+    assert list(masks[0]) == list(masks[1]) == ["v0", "v1"] and trained == 1.0
+    assert masks[0]["v0"][0].tolist() == [True] * 4 + [False] * 16
 
 
 def test_pixels_without_gaussians_belong_to_all_blocks_of_the_photograph():
@@ -82,5 +104,5 @@ def test_places_are_those_of_the_files():
 
 
 def test_a_block_without_photographs_is_refused():
-    with pytest.raises(InputError, match="block 1-0 has 0 photographs of which 25% show it, and training needs 2"):
+    with pytest.raises(InputError, match="block 1-0 has 0 photographs that show it, and training needs 2: give fewer"):
         cover(screen(), scene_of(looking_at(-0.9), looking_at(-0.8)), PLANE, [LEFT, RIGHT])
