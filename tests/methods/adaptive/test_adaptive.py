@@ -1,7 +1,6 @@
 """``adaptive``: which views it trains on, how it grows, when it ends, and that it continues byte for byte."""
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -395,9 +394,7 @@ def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
 def test_minutes_are_a_limit(scene_folder, tmp_path, capsys):
     run = tmp_path / "run"
     options = ["--recipe", "adaptive", "--test-every", "6", "--set", "min_step=100000"]
-    start = time.perf_counter()
     assert main(["train", str(scene_folder), *options, "--minutes", "0.1", "--out", str(run)]) == 0
-    assert time.perf_counter() - start < 60  # 6 s and the evaluation, on a machine that does other things too
     decisions = json.loads((run / "decisions.json").read_text())
     assert decisions["decisions"][0]["why"] == "--minutes 0.1 leaves no more time"
     assert (
