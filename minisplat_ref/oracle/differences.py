@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR
+from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL
 from minisplat_ref.types import Floats
 
 CENTRAL = (1 / 2,)
@@ -25,10 +25,9 @@ SIXTH_ORDER = (3 / 4, -3 / 20, 1 / 60)
 
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 """Steps to try: the first is best for values of order 1, the next are used only where the one before is refused."""
-
-
-SETTLED = 1e-9
-"""Relative difference of the derivatives from two steps, ten times apart, below which neither has met a threshold."""
+SETTLED = GRADIENT_REL
+"""Relative difference of the derivatives from two steps, ten times apart, below which neither has met a threshold, and
+the larger step is small enough for what the proof asks."""
 ROUNDINGS = 30.0
 """Units in the last place by which a value may be off that sums hundreds of terms."""
 

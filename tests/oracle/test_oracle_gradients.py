@@ -13,6 +13,7 @@ from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.differences import (
     CENTRAL,
     SIXTH_ORDER,
+    STEPS,
     Block,
     JacobianCheck,
     Point,
@@ -268,6 +269,18 @@ def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys):
 
 
 # --- thresholds that a function does not tell ---
+
+
+def test_a_step_is_confirmed_to_what_the_proof_asks():
+    """Of sin(1550 x) the derivative at 0 is 1550; a step h is wrong by (1550 h)^6 / 140, 1e-7 of it for the first."""
+
+    def wave(x):
+        return Point((np.sin(1550 * x),))
+
+    (first,) = derivative(wave, [0 * ONE], 0, ONE, STEPS[0])
+    (got,), used = settled_derivative(wave, [0 * ONE], 0, ONE)
+    assert 5e-8 < abs(first[0] / 1550 - 1) < 2e-7
+    assert used == STEPS[1] and abs(got[0] / 1550 - 1) < GRADIENT_REL / 100
 
 
 def test_a_derivative_settles_beside_a_kink():
