@@ -2,8 +2,8 @@
 
 ``python -m data_tools.block_times RUN --machines 1,2,4,8,16`` takes the processor seconds of the coarse model and of
 each block, as machines of one thread would take them, and gives the next block, in the order of the plan, to the
-machine that is free first, as ``train --blocks --cluster`` does. Plan and merge are not divided: their seconds are
-those between files of RUN, so RUN must not have been interrupted there. What goes over the network is what a block
+machine that is free first, as ``train --blocks --cluster`` does. Plan and merge, with the training of the merged
+model, are not divided: their seconds are those between files of RUN, so RUN must not have been interrupted there. What goes over the network is what a block
 reads (its part of the scene, the coarse model, its photographs) and what the merge reads of it; waiting for that is
 left out.
 """
@@ -67,11 +67,13 @@ def read_phases(run: Path) -> Phases:
         folder = training.run_folder_for(name)
         part = folder.with_suffix(".json")
         shown = {shown_name for shown_name, *_ in run_folder.read_json_object(part)["masks"]}
-        files = [part, folder.with_suffix(".npz"), coarse / run_folder.CHECKPOINT]
+        first = run_folder.CHECKPOINT if training.is_continued else run_folder.POINT_CLOUD
+        files = [part, folder.with_suffix(".npz"), coarse / first]
         files += [file for file in photographs if file.stem in shown]
         seconds.append(run_folder.read_json_object(folder / run_folder.METRICS)[CPU_TIME])
         n_read.append(sum(file.stat().st_size for file in files))
-        n_written.append((folder / run_folder.POINT_CLOUD).stat().st_size)
+        merged = [run_folder.POINT_CLOUD, *([run_folder.CHECKPOINT] if training.is_continued else [])]
+        n_written.append(sum((folder / file).stat().st_size for file in merged))
         ends.append((folder / run_folder.METRICS).stat().st_mtime)
     return Phases(
         coarse=run_folder.read_json_object(coarse / run_folder.METRICS)[CPU_TIME],

@@ -51,13 +51,14 @@ class Trained(NamedTuple):
         """Of its end."""
         return run_folder.read_json_object(self.folder / run_folder.METRICS)
 
-    def sum_of(self, key: str) -> float:
-        """Return the sum of a measure over all its trainings."""
-        return sum(run_folder.read_json_object(part / run_folder.METRICS)[key] for part in self.parts)
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of all its trainings."""
+        return float(self.metrics[CPU_TIME])
 
     @property
     def peak_mb(self) -> float:
-        """Memory of the largest of the processes that train it, without the coarse model's if there are others."""
+        """Memory of the largest of the processes that train it, without those of the coarse and the merged model."""
         parts = [part for part in self.parts if part.name != COARSE] or self.parts
         return max(run_folder.read_json_object(part / run_folder.METRICS)["peak_rss_mb"] for part in parts)
 
@@ -118,7 +119,7 @@ def _renderer(folder: Path, background: Floats) -> Any:
 def row_of(trained: Trained, seams: tuple[float, float]) -> list[float]:
     """Return the numbers of one training, in the order of HEADING."""
     metrics = trained.metrics
-    numbers = [trained.iterations, trained.sum_of(CPU_TIME), metrics["n_gaussians"]]
+    numbers = [trained.iterations, trained.cpu_seconds, metrics["n_gaussians"]]
     return [*numbers, metrics["psnr"], metrics["ssim"], *seams, trained.peak_mb]
 
 
@@ -143,7 +144,7 @@ def main() -> None:
         plan = load_plan(often.folder)
         assert plan is not None
         arms = {"whole": whole, "blocks": often}
-        if not rows and (share := whole.sum_of(CPU_TIME) / often.sum_of(CPU_TIME)) < SHARE_MIN:
+        if not rows and (share := whole.cpu_seconds / often.cpu_seconds) < SHARE_MIN:
             fewer = round(args.iterations * share)
         if fewer is not None:
             arms[SHORTER] = train(args.out / f"shorter-{seed}", [*words, "--iterations", str(fewer)])

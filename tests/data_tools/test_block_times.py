@@ -33,14 +33,16 @@ def test_rows_by_hand():
     assert row_of(PHASES, 2) == ["2", "10", "4", "90", "6", "110", "1.45", "73%"]
 
 
-def test_what_is_read_of_a_run(tmp_path, monkeypatch):
-    """Two blocks: the first shows a.png and b.png, the second b.png."""
+@pytest.mark.parametrize(("is_continued", "n_first", "n_written"), [(True, 50, (530, 640)), (False, 60, (30, 40))])
+def test_what_is_read_of_a_run(tmp_path, monkeypatch, is_continued, n_first, n_written):
+    """Two blocks: the first shows a.png and b.png, the second b.png; those that continue need checkpoints."""
     run, photographs = tmp_path / "run", tmp_path / "scene" / "images"
     photographs.mkdir(parents=True)
     (photographs / "a.png").write_bytes(bytes(1000))
     (photographs / "b.png").write_bytes(bytes(200))
-    sizes = {"coarse/checkpoint.npz": 50, "0-0.npz": 7, "1-0.npz": 9}
+    sizes = {"coarse/checkpoint.npz": 50, "coarse/point_cloud.ply": 60, "0-0.npz": 7, "1-0.npz": 9}
     sizes |= {"0-0/point_cloud.ply": 30, "1-0/point_cloud.ply": 40}
+    sizes |= {"0-0/checkpoint.npz": 500, "1-0/checkpoint.npz": 600}
     for name, size in sizes.items():
         (run / "blocks" / name).parent.mkdir(parents=True, exist_ok=True)
         (run / "blocks" / name).write_bytes(bytes(size))
@@ -54,7 +56,8 @@ def test_what_is_read_of_a_run(tmp_path, monkeypatch):
         (run / "blocks" / f"{name}.json").write_text(json.dumps({"masks": masks}))
     blocks = [SimpleNamespace(block=SimpleNamespace(name=name)) for name in parts]
     settings = SimpleNamespace(scene=str(tmp_path / "scene"))
-    training = SimpleNamespace(settings=settings, run_folder_for=lambda name: run / "blocks" / name)
+    folders = {"run_folder_for": lambda name: run / "blocks" / name}
+    training = SimpleNamespace(settings=settings, is_continued=is_continued, **folders)
     monkeypatch.setattr(block_times, "load_plan", lambda folder: SimpleNamespace(blocks=blocks))
     monkeypatch.setattr(block_times, "load_block_training", lambda folder: training)
     in_parts = [(run / "blocks" / f"{name}.json").stat().st_size for name in parts]
@@ -63,8 +66,8 @@ def test_what_is_read_of_a_run(tmp_path, monkeypatch):
         plan=4.0,
         blocks=(8.0, 9.0),
         merge=1.0,
-        n_read=(in_parts[0] + 7 + 50 + 1200, in_parts[1] + 9 + 50 + 200),
-        n_written=(30, 40),
+        n_read=(in_parts[0] + 7 + n_first + 1200, in_parts[1] + 9 + n_first + 200),
+        n_written=n_written,
     )
 
 

@@ -1,11 +1,19 @@
-"""Phase 4: the Gaussians of all blocks, each from the block in whose core it lies, as an ordinary run."""
+"""Phase 4: the Gaussians of all blocks, each from the block in whose core it lies, as an ordinary run.
+
+Where blocks continue the training of the whole, so does the merged model: with the moments and statistics that its
+Gaussians have in their blocks, it is trained for the last iterations on whole photographs.
+"""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.app.blocks.plan import COARSE, BlockTraining, Plan, Planned
-from minisplat_ref.app.runs import run_folder
+from minisplat_ref.app.runs import checkpoints, run_folder
 from minisplat_ref.app.runs.model_file import describe_parts
 from minisplat_ref.app.runs.progress import read_log, write_log
+from minisplat_ref.app.runs.scene_part import keep_rows
 from minisplat_ref.app.runs.settings import (
     configure_recipe,
     find_owner,
@@ -16,7 +24,7 @@ from minisplat_ref.app.runs.settings import (
 )
 from minisplat_ref.io.frames import return_points
 from minisplat_ref.strategy.ops import concat, contiguous, n_rows, take
-from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.adam import AdamState, zero_moments
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.pace import Pace
 from minisplat_ref.training.state import TrainState
@@ -24,7 +32,9 @@ from minisplat_ref.types import Bools, Floats, Scene
 
 
 def merge(training: BlockTraining, plan: Plan, scene: Scene) -> tuple[TrainState, list[str]]:
-    """Return the state of the merged model after its last iteration, and sentences about what is left out of it.
+    """Return the state of the merged model, and sentences about what is left out of it.
+
+    It is that after the last iteration, or, where blocks are continued, after that at which they stop.
 
     Parameters
     ----------
@@ -36,7 +46,7 @@ def merge(training: BlockTraining, plan: Plan, scene: Scene) -> tuple[TrainState
     """
     owner = find_owner(training.settings)
     recipe = configure_recipe(training.settings)._replace(starts_densely=False)
-    parts, steps, notices = [], [], []
+    parts, states, steps, notices = [], [], [], []
     for planned in plan.blocks:
         folder = training.run_folder_for(planned.block.name)
         settings, frame = plan.make_settings(training, planned), load_frame(folder)
@@ -46,17 +56,27 @@ def merge(training: BlockTraining, plan: Plan, scene: Scene) -> tuple[TrainState
         placed = place_model(return_model(kept, owner, frame), owner, scene.frame)
         parts.append(placed.gaussians)
         steps.append(run_folder.measured_step(folder) or 0)
+        if training.is_continued:
+            states.append(keep_rows(checkpoints.load(folder, settings), rows))
         if model.shared:
             notices.append(f"block {planned.block.name} has {describe_parts(sorted(model.shared))} of its own")
     state = initial_state(scene, recipe, training.settings.seed)
     state.gaussians = contiguous(concat(*parts))
     state.adam = zero_moments(state.gaussians)
     state.rng = np.random.default_rng(training.settings.seed)
-    state.step = training.settings.iterations
+    state.step = training.settings.iterations - training.joint_iterations
+    if states:
+        state.adam = AdamState(_join(states, "first"), _join(states, "second"), state.step)
+        state.stats = {name: np.concatenate([part.stats[name] for part in states]) for name in states[0].stats}
     if recipe.cooling is not None:
         state.step = max(steps)
         state.pace = Pace(cooling_from=state.step, last_step=state.step)
     return state, notices
+
+
+def _join(states: Sequence[TrainState], moment: str) -> Any:
+    """Return a moment of the Gaussians of all blocks."""
+    return contiguous(concat(*(getattr(state.adam, moment) for state in states)))
 
 
 def find_core_rows(plan: Plan, planned: Planned, points: Floats) -> Bools:

@@ -36,6 +36,7 @@ PLAN = "plan.json"
 COARSE = "coarse"
 COARSE_RECIPE = "3dgs-accel"  # every recipe can start from its Gaussians
 COARSE_PART = 4  # a quarter of the iterations of a training of the whole
+JOINT_PART = 5  # a fifth of them, the last, for the merged model, so that blocks fit together where they touch; ours
 COARSE_ITERATIONS = 1000  # for recipes that decide their own length
 CONTINUED = frozenset({"3dgs", COARSE_RECIPE})  # no step of theirs is for the scene as a whole
 PIXEL_BYTES = 4  # of a photograph, three, and of its mask
@@ -76,6 +77,11 @@ class BlockTraining(NamedTuple):
         n = COARSE_ITERATIONS if configure_recipe(self.settings).cooling is not None else whole // COARSE_PART
         n = max(1, min(n, whole))
         return replace(self.settings, recipe=COARSE_RECIPE, iterations=n, schedule_iterations=n, **FRESH)
+
+    @property
+    def joint_iterations(self) -> int:
+        """The last iterations of the whole, in which the merged model is trained, at the rates of the whole."""
+        return self.settings.iterations // JOINT_PART if self.is_continued else 0
 
 
 class Planned(NamedTuple):
@@ -173,7 +179,9 @@ def make_plan(training: BlockTraining, listing: Listing, scene: Scene, coarse: C
     places = plane.coordinates(coarse.means)  # [N, 2]
     planned = []
     for block, own in zip(blocks, masks, strict=True):
-        n_iterations = whole if cooling is not None else max(1, round(whole * len(own) / n_views))
+        n_iterations = whole
+        if cooling is None:
+            n_iterations = max(1, round((whole - training.joint_iterations) * len(own) / n_views))
         n_bytes = PIXEL_BYTES * sum(mask.size for mask in own.values())
         share = np.count_nonzero(block.region.contains(places)) / len(places)
         n_bytes += round(share * TRAINED_COPIES * sum(field.nbytes for field in gaussians))
@@ -217,6 +225,7 @@ def to_json(training: BlockTraining, plan: Plan) -> dict[str, Any]:
         "origin": plan.plane.origin.tolist(),
         "axes": plan.plane.axes.tolist(),
         "coarse_iterations": training.coarse.iterations,
+        "joint_iterations": training.joint_iterations,
         "iterations": count_iterations(training, plan),
         "trained_pixels": plan.trained,
         "blocks": [
@@ -265,7 +274,8 @@ def _planned(entry: dict[str, Any]) -> Planned:
 
 def count_iterations(training: BlockTraining, plan: Plan) -> int:
     """Return the iterations of all trainings together."""
-    return training.coarse.iterations + sum(planned.iterations - planned.n_done for planned in plan.blocks)
+    of_blocks = sum(planned.iterations - planned.n_done for planned in plan.blocks)
+    return training.coarse.iterations + of_blocks + training.joint_iterations
 
 
 def describe(training: BlockTraining, plan: Plan) -> str:

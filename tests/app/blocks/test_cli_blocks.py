@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from minisplat_ref.app.blocks import train as train_module
+from minisplat_ref.app.blocks.merge import merge
 from minisplat_ref.app.blocks.plan import load_block_training, load_plan, too_large
 from minisplat_ref.app.cli import main, train_blocks
 from minisplat_ref.app.runs import checkpoints, cluster, continued_part
@@ -21,6 +22,7 @@ from minisplat_ref.app.runs.scene_part import read_region
 from minisplat_ref.app.runs.settings import configure_recipe, load, load_photographs
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io import load_ply
+from minisplat_ref.io.frames import return_points
 from minisplat_ref.reference.compositing import composite_all_pairs
 from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.ops import n_rows
@@ -65,12 +67,14 @@ def test_the_folder_is_a_run_with_its_plan(finished, capsys):
     assert plan["grid"] == [2, 1] and plan["coarse_iterations"] == 4
     assert [block["name"] for block in plan["blocks"]] == ["0-0", "1-0"]
     assert sum(block["cameras"] for block in plan["blocks"]) == 8
-    for block in plan["blocks"]:  # of 16 iterations of 8 photographs, a quarter of which the coarse training has done
-        assert block["iterations"] == 2 * block["photographs"]
-        assert block["done_by_coarse"] == round(block["photographs"] / 2)
+    # Of 16 iterations of 8 photographs the last 3 are the merged model's, and the coarse training has done a quarter.
+    for block in plan["blocks"]:
+        assert block["iterations"] == round(13 * block["photographs"] / 8)
+        assert block["done_by_coarse"] == round(block["iterations"] / 4)
         run = read_json(finished / "blocks" / block["name"] / "metrics.json")
         assert run["iterations"] == block["iterations"]
-    assert plan["iterations"] == 4 + sum(block["iterations"] - block["done_by_coarse"] for block in plan["blocks"])
+    of_blocks = sum(block["iterations"] - block["done_by_coarse"] for block in plan["blocks"])
+    assert plan["joint_iterations"] == 3 and plan["iterations"] == 4 + of_blocks + 3
     metrics = read_json(finished / "metrics.json")
     assert metrics["iterations"] == 16 and len(metrics["per_view"]) == 3
     assert metrics["train_seconds"] > 0
@@ -80,17 +84,34 @@ def test_the_folder_is_a_run_with_its_plan(finished, capsys):
     assert "16 iterations" in capsys.readouterr().out
 
 
-def test_the_whole_is_of_the_cores(finished):
-    plan = load_plan(finished)
-    parts = []
+def test_the_whole_is_of_the_cores_and_its_last_iterations_are_joint(finished):
+    """Gaussians, moments and statistics are those of the blocks; three iterations of 16 are left, for all of them."""
+    training, plan = load_block_training(finished), load_plan(finished)
+    state, left_out = merge(training, plan, load_photographs(training.settings))
+    assert (state.step, state.adam.step, left_out) == (13, 13, [])
+    blocks = []
     for planned in plan.blocks:
-        gaussians = load_ply(finished / "blocks" / planned.block.name / "point_cloud.ply")
-        xy = (gaussians.means.astype(float) - plan.plane.origin) @ plan.plane.axes.T
+        folder = training.run_folder_for(planned.block.name)
+        block = checkpoints.load(folder, load(folder))
+        xy = plan.plane.coordinates(return_points(block.gaussians.means, block.frame))
         low, high = planned.block.core
         rows = (xy[:, 0] >= low[0]) & (xy[:, 0] < high[0])
-        assert 0 < rows.sum() < len(rows)
-        parts.append(gaussians.means[rows])
-    np.testing.assert_array_equal(load_ply(finished / "point_cloud.ply").means, np.concatenate(parts))
+        assert 0 < rows.sum() < len(rows) and block.adam.second.means[rows].any() and block.stats
+        blocks.append((block, rows))
+    for part in (
+        lambda s: s.gaussians,
+        lambda s: s.adam.first,
+        lambda s: s.adam.second,
+        lambda s: s.stats.values(),
+    ):
+        of_blocks = zip(*(tuple(field[rows] for field in part(block)) for block, rows in blocks), strict=True)
+        for merged, fields in zip(part(state), of_blocks, strict=True):
+            np.testing.assert_array_equal(merged, np.concatenate(fields))
+    end = load_ply(finished / "point_cloud.ply")
+    assert len(end.means) == n_rows(state.gaussians)
+    assert 0 < np.abs(end.means - return_points(state.gaussians.means, state.frame)).max()
+    steps = [json.loads(line)["step"] for line in (finished / "log.jsonl").read_text().splitlines()]
+    assert steps[-1] == 16 and 13 in steps
 
 
 def find_first_rows(plan, planned, coarse, scene, least):
