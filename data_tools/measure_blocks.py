@@ -12,6 +12,7 @@ an edge between cores than a twentieth of the cameras' reach.
 import argparse
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,6 +62,13 @@ class Trained(NamedTuple):
         """Memory of the largest of the processes that train it, without those of the coarse and the merged model."""
         parts = [part for part in self.parts if part.name != COARSE] or self.parts
         return max(run_folder.read_json_object(part / run_folder.METRICS)["peak_rss_mb"] for part in parts)
+
+
+def compile_kernels(words: list[str]) -> None:
+    """Train briefly, so that no training's time is that of the compiler."""
+    with tempfile.TemporaryDirectory() as folder:
+        brief = [*words, "--iterations", "20", "--out", str(Path(folder) / "run")]
+        subprocess.run([sys.executable, "-m", "minisplat_ref", "train", *brief], check=True)
 
 
 def train(folder: Path, words: list[str]) -> Trained:
@@ -134,6 +142,7 @@ def main() -> None:
     parser.add_argument("--downscale", default="1")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
+    compile_kernels([args.scene, "--recipe", args.recipe, "--downscale", args.downscale])
     rows: dict[str, list[list[float]]] = {}
     fewer: int | None = None
     for seed in args.seeds.split(","):
