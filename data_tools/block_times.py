@@ -2,10 +2,10 @@
 
 ``python -m data_tools.block_times RUN --machines 1,2,4,8,16`` takes the processor seconds of the coarse model and of
 each block, as machines of one thread would take them, and gives the next block, in the order of the plan, to the
-machine that is free first, as ``train --blocks --cluster`` does. Plan and merge, with the training of the merged
-model, are not divided: their seconds are those between files of RUN, so RUN must not have been interrupted there. What goes over the network is what a block
-reads (its part of the scene, the coarse model, its photographs) and what the merge reads of it; waiting for that is
-left out.
+machine that is free first, as ``train --blocks --cluster`` does. Plan and merge, with the training of the merged model,
+are not divided: their seconds are those between files of RUN, so RUN must not have been interrupted there. What goes
+over the network is what a block reads (its part of the scene, the coarse model, its photographs) and what the merge
+reads of it; waiting for that is left out.
 """
 
 import argparse
