@@ -1,8 +1,8 @@
 """What holds for every extension, by the reference: its gradients, and what its image does not depend on.
 
 A new extension is checked, too, without a line here. Gradients are the quick part of ``oracle gradients --extension
-NAME``: along random directions, without Jacobians, with the wider limit; kernels are held against the reference by the
-tests of each extension.
+NAME``: along random directions, without Jacobians, of half the Gaussians, with the wider limit; kernels are held
+against the reference by the tests of each extension.
 """
 
 import numpy as np
@@ -55,7 +55,7 @@ def first_acting(term, extension, rng):
 
 
 @pytest.mark.parametrize("name", sorted(EXTENSIONS.keys() - WITHOUT))
-def test_gradients_along_random_directions(name):
+def test_gradients_along_random_directions(name, small_proof):
     rng, stages = stages_of(EXTENSIONS[name])
     assert stages
     for stage, differentiate in stages:

@@ -13,7 +13,7 @@ from minisplat_ref import extensions
 from minisplat_ref.app.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions import extension
-from minisplat_ref.extensions.cuts import kernels as cut_kernels
+from minisplat_ref.extensions.analytic import kernels as analytic_kernels
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.geometry import losses as geometric_losses
 from minisplat_ref.extensions.micro import recipe as micro
@@ -45,27 +45,27 @@ def check(term):
 
 
 @pytest.fixture
-def wrong_cut_kernels(monkeypatch):
-    """The gradient of the mask with respect to the centre's pixel has the wrong sign in the kernels alone."""
-    right = cut_kernels._records_vjp
+def wrong_kernels(monkeypatch):
+    """The gradient of the integrals with respect to the angle has the wrong sign in the kernels alone."""
+    right = analytic_kernels._records_vjp
 
-    def wrong(conic_records_vjp, footprints, v_records):
-        flipped, columns = v_records.copy(), cut_kernels.columns_of(footprints.points.shape[1] // 4)
-        flipped[:, columns.shift : columns.n_gradients] *= -1
-        return right(conic_records_vjp, footprints, flipped)
+    def wrong(projection, v_records):
+        flipped = v_records.copy()
+        flipped[:, analytic_kernels.COS] *= -1
+        return right(projection, flipped)
 
-    monkeypatch.setattr(cut_kernels, "_records_vjp", wrong)
-    cut_kernels.make_cut_response.cache_clear()
+    monkeypatch.setattr(analytic_kernels, "_records_vjp", wrong)
+    analytic_kernels.pixel_response.cache_clear()
     yield
-    cut_kernels.make_cut_response.cache_clear()
+    analytic_kernels.pixel_response.cache_clear()
 
 
-def test_a_sign_in_the_kernels_alone_is_found(small_proof, wrong_cut_kernels, capsys):
-    code, output = proof(capsys, "cuts")
+def test_a_sign_in_the_kernels_alone_is_found(small_proof, wrong_kernels, capsys):
+    code, output = proof(capsys, "analytic")
     assert code == 1
     failed = re.findall(r"^\| (\S+): render .*FAILED", output, re.MULTILINE)
     assert set(failed) == {"cpu", "cpu-exact"} and re.search(r"\| reference: render .*passed", output)
-    assert "d image / d means is wrong" in output
+    assert "d image / d quats is wrong" in output
 
 
 def test_every_backend_is_checked_unless_one_is_named(small_proof, capsys):
@@ -136,7 +136,7 @@ def guide(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("factor", [1, 7])
-def test_the_guides_example(guide, factor, capsys):
+def test_the_guides_example(guide, small_proof, factor, capsys):
     """On each backend a Jacobian and inner products; where both are wrong, on compiled ones as on the reference."""
     guide("log_scales.sum(axis=1)", f"{factor} * log_scales.sum(axis=1)")
     code, output = proof(capsys, "round")
@@ -166,7 +166,11 @@ def test_a_derivative_that_is_left_out_is_found(left_out, capsys):
     name = {"channels": "depth", "alpha": "alpha"}[left_out]
     tiny, larger = check(term._replace(function=partly))
     assert f"d loss / d {name} is wrong" in tiny.note and f"the gradient with respect to {name} is zero" in larger.note
-    assert all(case.passed for case in check(term))
+
+
+def test_a_term_without_an_error_passes():
+    cases = check(geometric_losses.LOSSES[1])
+    assert len(cases) == 2 and all(case.passed for case in cases)
 
 
 def test_a_kink_is_no_error():
