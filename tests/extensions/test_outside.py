@@ -14,9 +14,14 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import minisplat_ref
+from minisplat_ref.app.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import load_ply, read_vertices, save_ply
 from minisplat_ref.jit.compile import cache_root, source_hash
+from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.rendering.backends import CPU
+from minisplat_ref.training.representation import GAUSSIANS
 from photo_scenes import edit_transforms, write_transforms
 from scenes import as_dtype, make_gaussians
 
@@ -160,8 +165,8 @@ class Stranger:
         self.package.mkdir(parents=True)
         for name, text in FILES.items():
             (self.package / name).write_text(text)
-        if (cache_root() / source_hash()).is_dir():  # the core's kernels, if this machine has compiled them
-            shutil.copytree(cache_root() / source_hash(), self.kernels)
+        # A copy of the core's kernels; other processes may be writing theirs, whose names contain ".tmp." until then.
+        shutil.copytree(cache_root() / source_hash(), self.kernels, ignore=shutil.ignore_patterns("*.tmp.*"))
         self.environment = os.environ | {
             "PYTHONPATH": str(ROOT),
             "MINISPLAT_EXTENSIONS": str(self.package.parent),
@@ -196,18 +201,28 @@ class Stranger:
 
 
 @pytest.fixture(scope="module")
-def stranger(tmp_path_factory):
-    return Stranger(tmp_path_factory.mktemp("stranger"))
-
-
-@pytest.fixture(scope="module")
-def scene(stranger):
+def scene(tmp_path_factory):
     """Six views of flat colours at six times, and some points."""
-    folder = write_transforms(stranger.folder / "scene", n=6, fl_x=40.0, ply_file_path="points.ply")
+    path = tmp_path_factory.mktemp("scenes") / "scene"
+    folder = write_transforms(path, n=6, fl_x=40.0, ply_file_path="points.ply")
     points = as_dtype(make_gaussians(np.random.default_rng(0), N, depth=0.0, size=0.3), np.float32)
     save_ply(folder / "points.ply", points)
     edit_transforms(folder / "transforms.json", lambda c: [f.update(time=i / 5) for i, f in enumerate(c["frames"])])
     return folder
+
+
+@pytest.fixture(scope="module")
+def core(scene, tmp_path_factory):
+    """What the stranger uses of the core, compiled where all tests find it: each stranger starts with a copy."""
+    out = tmp_path_factory.mktemp("core") / "run"
+    options = ["--iterations", str(ITERATIONS), "--test-every", "3"]
+    assert main(["train", str(scene), "--recipe", "3dgs-accel", *options, "--out", str(out)]) == 0
+    assert check_model_gradients(CPU, GSPLAT_MAIN, GAUSSIANS).n_failed == 0
+
+
+@pytest.fixture(scope="module")
+def stranger(core, tmp_path_factory):
+    return Stranger(tmp_path_factory.mktemp("stranger"))
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +320,7 @@ if __name__ == "__main__":
 """
 
 
-def test_what_is_compiled_ahead_is_what_training_uses(tmp_path, scene):
+def test_what_is_compiled_ahead_is_what_training_uses(tmp_path, scene, core):
     stranger = Stranger(tmp_path)
     (tmp_path / "warm.py").write_text(WARM_UP)
     command = [sys.executable, "warm.py"]
