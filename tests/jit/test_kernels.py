@@ -67,8 +67,8 @@ def test_no_garbage_is_collected_while_compiling():
 # --- dtype ---
 
 
-def every_stage(dtype, size=(24, 18), n=20):
-    """Everything that the stages return for a scene, and what they write beside it, by the stage's name."""
+def stages_of_training(dtype, size=(24, 18), n=20, **wanted):
+    """What the stages that every training uses return for a scene, by the stage's name, and what the others need."""
     rng, (width, height) = np.random.default_rng(20240229), size
     gaussians = as_dtype(make_gaussians(rng, n, size=0.25), dtype)
     camera = make_camera(width, height, fx=1.25 * width, fy=1.2 * width, rng=rng)
@@ -79,32 +79,42 @@ def every_stage(dtype, size=(24, 18), n=20):
     colors, background = CPU.sh_colors(*sh), np.zeros(3, dtype)
     bins = CPU.bin_gaussians(projection, TileGrid(width, height, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
     composited = (projection, colors, background, bins, GSPLAT_MAIN)
-    output = CPU.composite(*composited, with_stats=True, with_median_depth=True)
+    output = CPU.composite(*composited, **wanted)
     v = CPU.composite_vjp(*composited, output, output.image, output.alpha)
     v_projection = ProjectionGradient(v.means2d, v.opacities, v.conics, v.opacities)
-    ids = output.stats.dominant_ids
-    points = CPU.surface_points(means, quats, scales, camera, ids)
-    loss, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
-    geometry = (output.image[..., 0] + 1, output.alpha, output.image, camera, means.astype(float))
-    _, geometric_tape = geometry_kernels.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
     values = means.copy(), np.ones_like(means), np.zeros_like(means), np.ones_like(means)
     CPU.adam_update(*values, None, AdamStep(0.1, 0.9, 0.999, 1e-15))
     CPU.adam_update(*values, np.arange(0, n, 2), AdamStep(0.1, 0.9, 0.999, 1e-15))
-    return {
+    results = {
         "project": projection,
         "project_vjp": CPU.project_vjp(*primitives, projection, v_projection),
         "sh_colors": (colors,),
         "sh_colors_vjp": CPU.sh_colors_vjp(*sh, v.colors),
         "bin_gaussians": bins[:4],
-        "composite": (output.image, output.alpha, output.median_depth, *output.stats),
-        "composite without statistics": CPU.composite(*composited)[:2],
+        "composite": (output.image, output.alpha),
         "composite_vjp": v,
+        "adam_update": values,
+    }
+    return results, (primitives, composited, output)
+
+
+def every_stage(dtype, *scene):
+    """Everything that the stages return for a scene, and what they write beside it, by the stage's name."""
+    results, for_others = stages_of_training(dtype, *scene, with_stats=True, with_median_depth=True)
+    (means, quats, scales, _, camera, _), composited, output = for_others
+    ids = output.stats.dominant_ids
+    points = CPU.surface_points(means, quats, scales, camera, ids)
+    loss, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
+    geometry = (output.image[..., 0] + 1, output.alpha, output.image, camera, means.astype(float))
+    _, geometric_tape = geometry_kernels.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
+    return results | {
+        "statistics": (output.median_depth, *output.stats),
+        "composite without statistics": CPU.composite(*composited)[:2],
         "surface_points": points,
         "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),
         "photometric_loss": (np.array(loss),),
         "photometric_loss_vjp": (CPU.photometric_loss_vjp(tape),),
         "geometric_loss_vjp": geometry_kernels.geometric_loss_vjp(geometric_tape),
-        "adam_update": values,
     }
 
 
@@ -398,12 +408,12 @@ def test_kernels_of_functions_of_one_name_are_not_mixed_up(tmp_path):
 FROM_CACHE = """
 import sys
 import numpy as np
-from test_kernels import every_stage
+from test_kernels import every_stage, stages_of_training
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.training.loop import train
-arrays = {}
-for stage, results in every_stage(np.dtype(sys.argv[3]), (101, 67), 150).items():
+arrays, given = {}, (np.dtype(sys.argv[3]), (101, 67), 150)
+for stage, results in (every_stage(*given) if sys.argv[4] == "every" else stages_of_training(*given)[0]).items():
     arrays |= {f"{stage} {i}": array for i, array in enumerate(results)}
 state = train(load_scene(sys.argv[2]), get_recipe("3dgs-accel")._replace(iterations=50), seed=0)
 arrays |= {f"trained {name}": array for name, array in state.gaussians._asdict().items()}
@@ -411,9 +421,16 @@ np.savez(sys.argv[1], **arrays)
 """
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])  # compiling is the time
-def test_compiled_and_cached_kernels_give_the_same_bytes(dtype, tmp_path):
-    """Every stage, and a training; and the second process must not compile anything again.
+@pytest.mark.parametrize(
+    ("dtype", "which", "n_arrays", "n_kernels"),
+    [
+        ("float32", "of training", 38, 11),
+        pytest.param("float32", "every", 55, 20, marks=pytest.mark.slow),  # compiling is the time
+        pytest.param("float64", "every", 55, 20, marks=pytest.mark.slow),
+    ],
+)
+def test_compiled_and_cached_kernels_give_the_same_bytes(dtype, which, n_arrays, n_kernels, tmp_path):
+    """The stages, and a training; and the second process must not compile anything again.
 
     The body of a parallel loop is compiled two or three times, each time within other code, and a process that loads it
     may run another copy than the one that compiled it. The copies round alike if the same products are contracted in
@@ -427,14 +444,14 @@ def test_compiled_and_cached_kernels_give_the_same_bytes(dtype, tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(kernels), "PYTHONPATH": folders}
     results, cached = [], []
     for name in ("compiled.npz", "cached.npz"):
-        command = [sys.executable, "-c", FROM_CACHE, str(tmp_path / name), str(scene), dtype]
+        command = [sys.executable, "-c", FROM_CACHE, str(tmp_path / name), str(scene), dtype, which]
         subprocess.run(command, env=environment, check=True)
         with np.load(tmp_path / name) as arrays:
             results.append({key: arrays[key].tobytes() for key in arrays.files})
         cached.append(sorted(path.name for path in kernels.rglob("*.nbc")))
-    assert len(results[0]) > 45
+    assert len(results[0]) > n_arrays
     assert [key for key in results[0] if results[0][key] != results[1][key]] == []
-    assert len(cached[0]) > 20 and cached[0] == cached[1]
+    assert len(cached[0]) > n_kernels and cached[0] == cached[1]
 
 
 @pytest.mark.parametrize(
