@@ -20,6 +20,7 @@ from minisplat_ref.io import load_ply, load_scene, save_ply, write_image
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.label import Label
 from minisplat_ref.mechanisms.cameras.affine import downward
+from run_commands import in_process
 
 SIZE = 24
 TRAIN = ["--recipe", "satellite", "--iterations", "3", "--test-every", "3"]
@@ -126,7 +127,7 @@ def test_a_training_is_a_run(scene, tmp_path, capsys):
     assert "1 view (b) has moved" in capsys.readouterr().err
 
 
-def test_other_commands_know_the_scene(scene, tmp_path, capsys):
+def test_other_commands_know_the_scene(scene, tmp_path, capsys, monkeypatch):
     """``info`` says what a focal length means, half the size is half the pixels, pinholes are refused."""
     folder, satellite = str(scene[0]), ["--recipe", "satellite"]
     assert main(["info", folder]) == 0
@@ -141,6 +142,7 @@ def test_other_commands_know_the_scene(scene, tmp_path, capsys):
         assert main([*command, "--out", str(tmp_path / "none")]) == 2
         assert "train with --recipe satellite" in capsys.readouterr().err
         assert not (tmp_path / "none").exists()
+    monkeypatch.setattr("minisplat_ref.app.comparison.runs.train_here", in_process)
     short = ["--iterations", "2", "--test-every", "3", "--out", str(tmp_path / "compared")]
     assert main(["compare", folder, "--recipes", "satellite", *short]) == 0
 

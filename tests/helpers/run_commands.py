@@ -1,5 +1,7 @@
 """Trainings through the command line, for tests of run folders: options, refusals, an interruption."""
 
+import contextlib
+import io
 import json
 import signal
 
@@ -20,6 +22,17 @@ def write_room(folder, name="room", **settings):
     """Write a synthetic scene into a folder, and return it."""
     write_scene(make_scene(name, supersampling=1, **settings), folder, settings)
     return folder
+
+
+def in_process(words):
+    """Carry out a command here; a stand-in for ``train_here``, which starts a process for each training."""
+    return main([str(word) for word in words])
+
+
+def in_process_silently(words):
+    """The same without its lines, for tests of what the program around it prints."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return in_process(words)
 
 
 def read_json(path):

@@ -30,6 +30,7 @@ from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.types import View
 from networks import random_network, random_weights, write_network
 from photo_scenes import write_colmap
+from run_commands import in_process
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM, LPIPS_FLOAT32, PARITY_FLOAT64
 
@@ -362,7 +363,8 @@ def test_refused_before_training(weights, tmp_path, capfd, command, case, reason
     assert not (tmp_path / "out").exists()
 
 
-def test_compare_shows_lpips(scene_folder, weights, tmp_path, capfd):
+def test_compare_shows_lpips(scene_folder, weights, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr("minisplat_ref.app.comparison.runs.train_here", in_process)
     options = ["--recipes", "3dgs-accel", "--iterations", "6", "--test-every", "4", "--lpips-weights", str(weights)]
     assert main(["compare", str(scene_folder), *options, "--out", str(tmp_path / "out")]) == 0
     content = json.loads((tmp_path / "out" / "compare.json").read_text())

@@ -27,17 +27,13 @@ from minisplat_ref.reference.compositing import composite_all_pairs
 from minisplat_ref.rendering.backends import REFERENCE
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.pace import Pace
-from run_commands import contents, read_json, refused, write_room  # noqa: F401  (a fixture)
+from run_commands import contents, in_process, read_json, refused, write_room  # noqa: F401  (a fixture)
 from scenes import activated, as_dtype
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 120, "test_every": 4}
 OPTIONS = ["--recipe", "3dgs-accel", "--iterations", "16", "--test-every", "4", "--seed", "3"]
 BLOCKS = ["--blocks", "2x1"]
 FILES = ("plan.json", "plan.png", "point_cloud.ply", "blocks/0-0.npz", "blocks/1-0/point_cloud.ply")
-
-
-def in_process(words):
-    return main([str(word) for word in words])
 
 
 @pytest.fixture(scope="module")

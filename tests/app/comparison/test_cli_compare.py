@@ -43,7 +43,7 @@ from minisplat_ref.methods import RECIPES
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.training.schedule import At, describe
 from minisplat_ref.types import Gaussians, Model
-from run_commands import write_room
+from run_commands import in_process_silently, write_room
 from tolerances import CLOSED_FORM
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -67,7 +67,8 @@ def scene_folder(tmp_path_factory):
 def compared(scene_folder, tmp_path_factory):
     """A comparison from the command line, and what it has printed itself."""
     folder = tmp_path_factory.mktemp("comparisons") / "compared"
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.setattr(runs_module, "train_here", in_process_silently)
         assert main(["compare", str(scene_folder), *OPTIONS, "--out", str(folder)]) == 0
     return folder, printed.getvalue()
 

@@ -14,8 +14,9 @@ import pytest
 pytest.importorskip("distributed")
 
 from minisplat_ref.app.cli import main
+from minisplat_ref.app.comparison import runs as runs_module
 from minisplat_ref.app.runs import cluster
-from run_commands import write_room
+from run_commands import in_process, write_room
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 OPTIONS = ["--recipes", "3dgs-accel", "--seeds", "0,1", "--iterations", "6", "--test-every", "4", "--eval-every", "2"]
@@ -32,7 +33,9 @@ def scene_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def in_turn(scene_folder, tmp_path_factory):
-    return compare(scene_folder, tmp_path_factory.mktemp("turn") / "out", "--workers", "0")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs_module, "train_here", in_process)
+        return compare(scene_folder, tmp_path_factory.mktemp("turn") / "out", "--workers", "0")
 
 
 def compare(scene_folder, out, *options):

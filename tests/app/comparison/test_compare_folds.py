@@ -14,7 +14,7 @@ from minisplat_ref.app.comparison.metrics import METRICS, RecipeMetrics, Spread,
 from minisplat_ref.app.comparison.plan import load_plan
 from minisplat_ref.app.comparison.table import photograph_cells, table_cells
 from minisplat_ref.app.runs.settings import load as load_settings
-from run_commands import write_room
+from run_commands import in_process_silently, write_room
 from tolerances import CLOSED_FORM
 
 SCENE = {"n_views": 7, "width": 32, "height": 24, "n_points": 60, "test_every": 0}
@@ -32,12 +32,11 @@ def scene_folder(tmp_path_factory):
 def stopped(scene_folder, tmp_path_factory):
     """Ctrl-C in the fourth of six trainings, before its first checkpoint."""
     folder = tmp_path_factory.mktemp("comparisons") / "stopped"
-    train = runs_module.train_here
 
     def press_ctrl_c(words):
         if words[-1].endswith(RUNS[3]):
             raise KeyboardInterrupt
-        return train(words)
+        return in_process_silently(words)
 
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()):
         patch.setattr(runs_module, "train_here", press_ctrl_c)
@@ -50,7 +49,8 @@ def compared(stopped, tmp_path_factory):
     """The same, continued, and what was printed."""
     folder = tmp_path_factory.mktemp("comparisons") / "compared"
     shutil.copytree(stopped, folder)
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.setattr(runs_module, "train_here", in_process_silently)
         assert main(["compare", "--resume", str(folder)]) == 0
     return folder, printed.getvalue()
 

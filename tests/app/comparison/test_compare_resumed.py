@@ -20,7 +20,7 @@ from minisplat_ref.app.comparison.runs import make_settings, statuses
 from minisplat_ref.app.runs.progress import Progress, read_log
 from minisplat_ref.app.runs.settings import load as load_settings
 from minisplat_ref.errors import InputError
-from run_commands import write_room
+from run_commands import in_process_silently, write_room
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 12
@@ -37,12 +37,11 @@ def scene_folder(tmp_path_factory):
 def stopped(scene_folder, tmp_path_factory):
     """A comparison that Ctrl-C ended after its first training, before its second."""
     folder = tmp_path_factory.mktemp("comparisons") / "stopped"
-    train = runs_module.train_here
 
     def press_ctrl_c(words):
         if SECOND in words[-1]:
             raise KeyboardInterrupt
-        return train(words)
+        return in_process_silently(words)
 
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as errors:
         patch.setattr(runs_module, "train_here", press_ctrl_c)
@@ -59,7 +58,8 @@ def folder(stopped, tmp_path):
 
 
 def resume(folder):
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.setattr(runs_module, "train_here", in_process_silently)
         assert main(["compare", "--resume", str(folder)]) == 0
     return [line for line in printed.getvalue().splitlines() if line.startswith("run ")]
 

@@ -25,7 +25,7 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train as train_state
 from minisplat_ref.training.recipe_settings import configure
 from photo_scenes import write_colmap
-from run_commands import write_room
+from run_commands import in_process, write_room
 from tolerances import ROUNDED_TO_FLOAT32
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -203,6 +203,7 @@ def test_refused(photographs, tmp_path, capfd, command, case, reason):
 
 def test_compare_starts_all_from_it(scene_folder, dense, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(runs, "warm_up", lambda plan, scene: None)
+    monkeypatch.setattr(runs, "train_here", in_process)
     options = ["--recipes", "3dgs,3dgs-accel", "--iterations", "4", "--test-every", "4", "--init", str(dense)]
     assert main(["compare", str(scene_folder), *options, "--out", str(tmp_path / "out")]) == 0
     assert capfd.readouterr().out.count(f"starts from 119 points of {dense}") == 2
