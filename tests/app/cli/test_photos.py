@@ -32,6 +32,19 @@ def out(tmp_path):
     return tmp_path / "out"
 
 
+@pytest.fixture
+def asked(monkeypatch):
+    """The commands that are run; trainings are of 30 iterations, however long they may take."""
+    commands, real = [], photos_command.do
+
+    def shortened(*words):
+        commands.append(words)
+        return real(*words, *(("--iterations", "30") if words[0] == "train" and "--resume" not in words else ()))
+
+    monkeypatch.setattr(photos_command, "do", shortened)
+    return commands
+
+
 def photos(out, *options):
     return main(["photos", str(out.parent / "photos"), "--out", str(out), *options])
 
@@ -74,8 +87,8 @@ def check_report_shows_the_scene(report, folder):
     assert " view " in following and " photos PHOTOS" in following and "scene.html" not in following
 
 
-def test_extras_are_named_where_they_are_missing(out, capsys, monkeypatch):
-    assert photos(out, "--minutes", "0.1") == 0
+def test_extras_are_named_where_they_are_missing(out, asked, capsys, monkeypatch):
+    assert photos(out) == 0
     capsys.readouterr()
     missing = set()
     monkeypatch.setattr(next_steps, "find_spec", lambda package: None if package in missing else package)
@@ -88,11 +101,11 @@ def test_extras_are_named_where_they_are_missing(out, capsys, monkeypatch):
     assert "'minisplat_ref[meshes]'): " in surface and " mesh " in surface
 
 
-def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):
+def test_what_is_there_is_not_done_again(out, asked, capsys, monkeypatch):
     """After an interruption of the training it continues there; at the end nothing is left to do."""
     with monkeypatch.context() as patched:
         interrupt_at(7, patched)
-        assert photos(out, "--minutes", "0.1") == 130
+        assert photos(out) == 130
     assert steps_of(capsys.readouterr().out) == ["train"]
     assert photos(out) == 0
     assert steps_of(capsys.readouterr().out) == ["train", "convert", "render"]
@@ -103,8 +116,8 @@ def test_what_is_there_is_not_done_again(out, capsys, monkeypatch):
     assert steps_of(capsys.readouterr().out) == []
 
 
-def test_another_up_makes_page_and_film_again_and_is_recorded(out, capsys):
-    assert photos(out, "--minutes", "0.1") == 0
+def test_another_up_makes_page_and_film_again_and_is_recorded(out, asked, capsys):
+    assert photos(out) == 0
     page, film = (out / "scene.html").read_bytes(), (out / "film.gif").read_bytes()
     capsys.readouterr()
     assert photos(out, "--up", "0,0,1") == 0
@@ -159,18 +172,10 @@ def test_a_size_that_trains_in_minutes(size, factor):
 @pytest.mark.parametrize(
     ("n_views", "options", "recipe"), [(6, (), "adaptive"), (5, ("0",), "adaptive"), (4, ("0",), "3dgs-accel")]
 )
-def test_few_photographs_are_all_trained_on(tmp_path, capsys, monkeypatch, n_views, options, recipe):
+def test_few_photographs_are_all_trained_on(tmp_path, asked, capsys, n_views, options, recipe):
     """Of six one is held out, of five none; four are fewer than adaptive needs."""
     write_room(tmp_path / "out" / "scene", **(SCENE | {"n_views": n_views - 1}))  # and one more is held out
     (tmp_path / "photos").mkdir()
-    asked = []
-    real = photos_command.do
-
-    def shortened(*words):
-        asked.append(words)
-        return real(*words, *(("--iterations", "30") if words[0] == "train" else ()))
-
-    monkeypatch.setattr(photos_command, "do", shortened)
     assert photos(tmp_path / "out") == 0
     held_out = re.findall("--test-every ([0-9]+)", " ".join(map(str, asked[0])))
     assert asked[0][0] == "train" and tuple(held_out) == options
