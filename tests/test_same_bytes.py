@@ -43,11 +43,8 @@ def digest(process, out):
 
 @pytest.mark.parametrize("recipe", ITERATIONS)
 def test_same_bytes_at_any_number_of_threads_and_two_at_once(recipe, scene, tmp_path):
-    digests = set()
-    for n_threads in (1, 3):
-        out = tmp_path / f"threads{n_threads}"
-        digests.add(digest(started(scene, out, recipe, n_threads), out))
-    outs = [tmp_path / name for name in ("first", "second")]
-    both = [started(scene, out, recipe, 2) for out in outs]
-    digests.update(digest(process, out) for process, out in zip(both, outs, strict=True))
+    outs = [tmp_path / f"threads{n_threads}" for n_threads in (1, 2, 3)]
+    digests = {digest(started(scene, outs[0], recipe, 1), outs[0])}
+    both = [started(scene, out, recipe, n_threads) for n_threads, out in enumerate(outs[1:], 2)]
+    digests.update(digest(process, out) for process, out in zip(both, outs[1:], strict=True))
     assert len(digests) == 1
