@@ -182,7 +182,12 @@ def assert_same(got, expected, tolerance):
 
 def test_one_dome_by_hand():
     domes = Domes(
-        np.array([[2.5, 1.5]]), np.array([4.0]), np.array([0.8]), np.ones(1), np.zeros((1, 2)), np.array([[0, 0, 9, 9]])
+        means2d=np.array([[2.5, 1.5]]),
+        radii=np.array([4.0]),
+        opacities=np.array([0.8]),
+        depths=np.ones(1),
+        slopes=np.zeros((1, 2)),
+        boxes=np.array([[0, 0, 9, 9]], np.int32),
     )
     bins = REFERENCE.bin_gaussians(
         Projection(domes.means2d, *[domes.depths] * 4, domes.boxes), TileGrid(9, 9, 16, 16), GSPLAT_MAIN
@@ -250,20 +255,6 @@ def test_conventions_stop_gradients_at_the_clamp(conventions, order, rng):
     assert np.abs(results[0]["means2d"] - results[1]["means2d"]).max() > GRADIENT_FLOOR
 
 
-def test_float32_data(rng):
-    """Without jumps at thresholds, where float32 may fall on the other side."""
-    case = dome_case(rng, 60)
-    domes = Domes(*(field.astype(np.float32).astype(field.dtype) for field in case.arguments[0]))
-    smooth = GSPLAT_MAIN._replace(alpha_min=1e-6, transmittance_min=0.0)
-    case = Case((domes, *case.arguments[1:4], smooth), case.v_output)
-    expected = both_ways(plain, KERNEL_DOMES._replace(buffer_size=EXACT_ORDER), case)
-    domes, colors, background, *rest = case.arguments
-    narrow = Case((domes, colors.astype(np.float32), background.astype(np.float32), *rest), case.v_output)
-    got = both_ways(plain, KERNEL_DOMES._replace(buffer_size=EXACT_ORDER), narrow)
-    assert {got[name].dtype for name in ("image", "alpha", "colors", "background")} == {np.dtype(np.float32)}
-    assert_same(got, expected, PARITY_FLOAT32_GRADIENT)
-
-
 # --- the conic ---
 
 
@@ -300,9 +291,9 @@ def test_plain_conic_in_float32(rng):
     assert got["conics"].dtype == np.float64 and {got[n].dtype for n in got if n != "conics"} == {np.dtype(np.float32)}
     assert np.abs(got["image"] - expected["image"]).max() < PARITY_FLOAT32_IMAGE
     assert_same(got, expected, PARITY_FLOAT32_GRADIENT)
-    exact = both_ways(plain, conic_response(exp_exact), case)
-    assert not np.array_equal(exact["image"], got["image"])
-    assert np.abs(exact["image"] - by_stages(CPU_EXACT, case)["image"]).max() < PARITY_FLOAT32_IMAGE
+    exact = plain.composite_hits(conic_response(exp_exact), *case.arguments).image
+    assert not np.array_equal(exact, got["image"])
+    assert np.abs(exact - CPU_EXACT.composite(*case.arguments).image).max() < PARITY_FLOAT32_IMAGE
 
 
 @pytest.mark.parametrize("order", [3, EXACT_ORDER])
