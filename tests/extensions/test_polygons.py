@@ -263,7 +263,7 @@ def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, rng):
         assert np.abs(found - expected).max() <= gradient_rel * scale, name
 
 
-def test_the_gradient_of_the_whole_model():
+def test_the_gradient_of_the_whole_model(small_proof):
     report = check_model_gradients(CPU, GSPLAT_MAIN, TRACED, stages)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 

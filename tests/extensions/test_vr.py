@@ -180,7 +180,7 @@ def test_a_gaze_outside_is_refused(gaze, rng):
         render_foveated(Model(make_gaussians(rng, 2)), CAMERA, REQUEST, gaze, BUFFER)
 
 
-def test_the_gradient_of_the_whole_model():
+def test_the_gradient_of_the_whole_model(small_proof):
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, HEADSET, stages)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 

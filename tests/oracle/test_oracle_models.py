@@ -49,7 +49,7 @@ def amplified(error=1.0, with_sky=False):
 
 
 @pytest.mark.parametrize("with_sky", [False, True])
-def test_shared_parameters_are_checked(with_sky):
+def test_shared_parameters_are_checked(with_sky, small_proof):
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, amplified(with_sky=with_sky))
     assert report.n_failed == 0, report.cases
     stage = model_stage(REFERENCE, tiny_setting(), amplified(with_sky=with_sky), np.random.default_rng(0))
@@ -57,12 +57,12 @@ def test_shared_parameters_are_checked(with_sky):
     assert stage.inputs["gain"].dtype == np.float64 and (stage.inputs["gain"] != 1).all()
 
 
-def test_a_wrong_shared_gradient_is_found():
+def test_a_wrong_shared_gradient_is_found(small_proof):
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, amplified(error=1 + 1e-7))
     assert [case.passed for case in report.cases] == [False, False] and "gain is wrong" in report.cases[0].note
 
 
-def test_a_parameter_that_does_nothing_is_no_proof():
+def test_a_parameter_that_does_nothing_is_no_proof(small_proof):
     representation = GAUSSIANS._replace(shared=lambda scene, rng: {"idle": np.ones(2)})
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, representation)
     assert "nothing was checked about idle" in report.cases[0].note and report.n_failed == 2
@@ -91,7 +91,7 @@ def test_thresholds_are_seen(backend, field, value):
     assert any(not np.array_equal(a, b) for a, b in zip(sides, others, strict=True))
 
 
-def test_stages_of_an_extension_are_checked_too():
+def test_stages_of_an_extension_are_checked_too(small_proof):
     def stages(backend, setting, rng):
         return (project_stage(backend, setting)._replace(name="mine"),)
 
@@ -122,14 +122,14 @@ def test_the_command(tmp_path, capsys):
     assert all(0 < case["error"] <= case["limit"] == 1e-8 for case in report["cases"])
 
 
-def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys):
+def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys, small_proof):
     wrong = extension.Extension("velocity", representation=amplified(error=1.01))
     monkeypatch.setattr(extension, "load_extension", lambda name: wrong)
     assert main(["oracle", "gradients", "--extension", "velocity"]) == 1
     assert "gain is wrong" in capsys.readouterr().out
 
 
-def test_a_field_of_learning_rate_zero_is_held():
+def test_a_field_of_learning_rate_zero_is_held(small_proof):
     """A bound that only selects has no derivative: without a rate of 0 it is said that nothing was checked about it."""
 
     fields = {name: np.ndarray for name in (*Gaussians._fields, "bounds")}
@@ -145,7 +145,7 @@ def test_a_field_of_learning_rate_zero_is_held():
     assert check_model_gradients(REFERENCE, GSPLAT_MAIN, held).n_failed == 0
 
 
-def test_a_stage_with_the_renderers_name_takes_its_place():
+def test_a_stage_with_the_renderers_name_takes_its_place(small_proof):
     def stages(backend, setting, rng):
         return (model_stage(backend, setting, GAUSSIANS, rng)._replace(vjp=lambda *v: 1 / 0),)
 
