@@ -18,6 +18,7 @@ from minisplat_ref.app.blocks.plan import load_block_training, load_plan, too_la
 from minisplat_ref.app.cli import main, train_blocks
 from minisplat_ref.app.runs import checkpoints, cluster, continued_part
 from minisplat_ref.app.runs.continued_part import continue_part, find_beginning
+from minisplat_ref.app.runs.progress import read_log
 from minisplat_ref.app.runs.scene_part import read_region
 from minisplat_ref.app.runs.settings import configure_recipe, load, load_photographs
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -106,8 +107,10 @@ def test_the_whole_is_of_the_cores_and_its_last_iterations_are_joint(finished):
     end = load_ply(finished / "point_cloud.ply")
     assert len(end.means) == n_rows(state.gaussians)
     assert 0 < np.abs(end.means - return_points(state.gaussians.means, state.frame)).max()
-    steps = [json.loads(line)["step"] for line in (finished / "log.jsonl").read_text().splitlines()]
-    assert steps[-1] == 16 and 13 in steps
+    records = {record["step"]: record for record in read_log(finished / "log.jsonl")}
+    losses = [read_log(training.run_folder_for(p.block.name) / "log.jsonl")[-1]["loss"] for p in plan.blocks]
+    assert list(records)[-1] == 16 and records[13]["loss"] == pytest.approx(np.mean(losses))
+    assert records[13]["model_mb"] == sum(field.nbytes for field in state.gaussians) / 1e6
 
 
 def find_first_rows(plan, planned, coarse, scene, least):
