@@ -6,9 +6,10 @@ independently of each other, on one machine or on many (``minisplat-ref train SC
 1. *Coarse.* The whole scene is trained for a quarter of the iterations.
 2. *Plan.* Cores have equal numbers of cameras, are half-open and cover the plane. A block's region is its core with a
    fifth of its width around. A photograph belongs to each block that at least 25 % of its pixels show, by the coarse
-   model; pixels that show other blocks are masked.
+   model, and to others until nearly all of its pixels have a block; pixels that show other blocks are masked.
 3. *Blocks.* Each starts from the coarse model's Gaussians in its region, and is an ordinary run.
-4. *Merge.* Of each block the Gaussians in its core.
+4. *Merge.* Of each block the Gaussians in its core. Where blocks continue the coarse training, the merged model is
+   trained for the last fifth of the iterations.
 
 Dividing by cameras and deciding by visibility follow VastGaussian and CityGaussian; left out: appearance per
 photograph, levels of detail, and blocks that communicate while they train (DOGS).
