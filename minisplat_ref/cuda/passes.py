@@ -22,7 +22,7 @@ from minisplat_ref.cuda.adam import list_on_device
 from minisplat_ref.cuda.arrays import empty, to_device, write_zeros
 from minisplat_ref.cuda.compositing import blend, collect_stats
 from minisplat_ref.cuda.compositing.backward import backward_kernel
-from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS, footprint_vjp, slots_of_row, sum_column
+from minisplat_ref.cuda.compositing.pair_sums import N_MOMENTS, N_PAIR_STATS, footprint_vjp, slots_of_row, sum_column
 from minisplat_ref.cuda.compositing.records import COLOR, store_record
 from minisplat_ref.cuda.compositing.tiles import BLOCK, Pixels, pass_background
 from minisplat_ref.cuda.footprints import TILE, reached_tiles
@@ -39,7 +39,7 @@ from minisplat_ref.cuda.projection import (
 from minisplat_ref.cuda.scanning import take_block
 from minisplat_ref.cuda.spherical_harmonics import Viewpoint, clear_color, degree_of, pass_viewpoint, shading
 from minisplat_ref.cuda.target import ROW_THREADS, GpuKernel, cuda, device_function, gpu_kernel, launch, launch_rows
-from minisplat_ref.cuda.workspace import Workspace
+from minisplat_ref.cuda.workspace import GROWTH, Workspace
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.activation import activate_opacity, activate_opacity_vjp, activate_scale, activate_scale_vjp
 from minisplat_ref.scalar.compositing import Frame
@@ -299,14 +299,22 @@ class Passes:
         """
         n_pairs = tiling.count_pairs(tape.survey)
         if n_pairs > self._capacity:
-            self._capacity = tiling.capacity_for(n_pairs)
+            self._capacity = tiling.capacity_for(n_pairs, self.pair_bytes(tape), tape.capacity)
         return n_pairs
+
+    def pair_bytes(self, tape: Tape) -> int:
+        """Return the bytes that a pair (tile, Gaussian) of such a view takes: lists, statistics, and sums."""
+        size = tape.output.image.dtype.itemsize
+        n_stats = 0 if tape.output.stats is None else N_PAIR_STATS
+        n_sums = 0 if self.is_atomic else N_MOMENTS + N_CHANNELS
+        return tiling.LIST_BYTES + size * (n_stats + n_sums)
 
     def render_vjp(self, tape: Tape, v_image: Floats, v_alpha: Floats) -> Differentiated:
         """Chain the gradient of the image [H, W, 3] and of its alpha [H, W], on the device, to the parameters."""
         workspace, g, dtype = self._workspace, tape.gaussians, tape.output.image.dtype
         n, n_tiles = len(g.means), len(tape.lists.offsets) - 1
-        slots = workspace.array("slot_sums", (n if self.is_atomic else tape.capacity, N_MOMENTS + N_CHANNELS), dtype)
+        n_slots, growth = (n, GROWTH) if self.is_atomic else (tape.capacity, 1)
+        slots = workspace.array("slot_sums", (n_slots, N_MOMENTS + N_CHANNELS), dtype, growth)
         if self.is_atomic:
             write_zeros(slots)
         launch(

@@ -44,7 +44,6 @@ from minisplat_ref.cuda.target import (
 )
 from minisplat_ref.cuda.workspace import GROWTH, Workspace
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.memory import BYTES_PER_PAIR
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 N_ROW_SUMS = ROW_THREADS // WARP + 1  # of the warps of a block, and of all of them
@@ -52,6 +51,7 @@ MAX_TILE_DIGITS, MAX_DEPTH_DIGITS = 32 // DIGIT_BITS, 64 // DIGIT_BITS
 N_ROWS, N_PAIRS = range(2)  # places in the counters: the Gaussians, and the pairs that fit; after them come all others
 CLEARING_BLOCKS = 1 if is_simulated else 1024
 FIRST_CAPACITY = 4  # pairs of a Gaussian, before the first pass has counted them
+LIST_BYTES = 6 * 4  # per pair: six arrays of int32 (see list_pairs)
 
 
 class Chain(NamedTuple):
@@ -273,10 +273,10 @@ def list_pairs(workspace: Workspace, plan: Plan, survey: Survey, boxes: Any, gri
     """Return the lists of all tiles after a survey."""
     n, n_tiles, capacity = plan.n, grid.n_tiles_x * grid.n_tiles_y, (plan.capacity,)
 
-    def numbers(name: str, shape: tuple[int, ...] = capacity) -> Any:
-        return workspace.array(name, shape, np.int32)
+    def numbers(name: str) -> Any:
+        return workspace.array(name, capacity, np.int32, growth=1)
 
-    spare = workspace.array("other_keys", (n,), survey.keys.dtype), numbers("other_order", (n,))
+    spare = workspace.array("other_keys", (n,), survey.keys.dtype), workspace.array("other_order", (n,), np.int32)
     _, by_depth = sort_by_digits((survey.keys, survey.order), spare, plan.depth_digits, survey.counters)
     ids, tiles, slots = numbers("ids"), numbers("tiles"), numbers("slots")
     launch_rows(write_pairs, n, boxes, by_depth, survey, plan.pairs, grid.n_tiles_x, ids, tiles, slots)
@@ -293,16 +293,25 @@ def count_pairs(survey: Survey) -> int:
     return int(to_host(survey.offsets[n:])[0])
 
 
-def capacity_for(n_pairs: int) -> int:
+def capacity_for(n_pairs: int, pair_bytes: int, n_before: int = 0) -> int:
     """Return the capacity to provide for so many pairs, somewhat more than they need.
+
+    Parameters
+    ----------
+    n_pairs : int
+    pair_bytes : int
+        Of all arrays with a row for each pair.
+    n_before : int
+        Capacity of lists that are freed for the new ones.
 
     Raises
     ------
     InputError
         The device has no memory for them.
     """
-    check_room(n_pairs * BYTES_PER_PAIR, f"{n_pairs:,} pairs (tile, Gaussian)")
-    return int(GROWTH * n_pairs) + ROW_THREADS
+    capacity = int(GROWTH * n_pairs) + ROW_THREADS
+    check_room(capacity * pair_bytes - n_before * LIST_BYTES, f"{n_pairs:,} pairs (tile, Gaussian)")
+    return capacity
 
 
 def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
@@ -317,7 +326,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
         n_pairs = count_pairs(survey)
         if n_pairs <= plan.capacity:
             break
-        capacity = capacity_for(n_pairs)
+        capacity = capacity_for(n_pairs, LIST_BYTES)
     lists = list_pairs(workspace, plan, survey, boxes, grid)
     bins = TileBins(lists.ids[:n_pairs], lists.offsets, lists.slots[:n_pairs], survey.offsets, grid)
     return bins if is_on_device(projection.depths) else to_host(bins)

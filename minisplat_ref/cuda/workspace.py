@@ -21,10 +21,11 @@ class Workspace:
         self._memory: dict[str, Any] = {}
         self._arrays: dict[str, Any] = {}
 
-    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, growth: float = GROWTH) -> Any:
         """Return an uninitialised array of the device.
 
-        It shares its memory with the last array of that name, which is no longer to be used.
+        It shares its memory with the last array of that name, which is no longer to be used. One that has to grow
+        becomes ``growth`` times as large as what is asked for: 1 where the shape has room to spare already.
         """
         dtype, array = np.dtype(dtype), self._arrays.get(name)
         if array is not None and array.shape == shape and array.dtype == dtype:
@@ -38,7 +39,7 @@ class Workspace:
                 memory = self._memory[name] = empty(size, dtype)
             elif len(memory) < size:
                 self._memory[name] = self._arrays[name] = memory = array = None  # frees it first
-                memory = self._memory[name] = empty(int(GROWTH * size), dtype)
+                memory = self._memory[name] = empty(int(growth * size), dtype)
             array = memory[:size].reshape(*shape)
         self._arrays[name] = array
         return array

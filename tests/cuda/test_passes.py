@@ -66,6 +66,14 @@ def test_without_room_for_its_pairs_a_view_is_empty_and_says_so(simulated):
         assert x.tobytes() == y.tobytes()
 
 
+def test_more_room_takes_the_bytes_of_the_pairs_and_the_host_asks_for_them_before(simulated):
+    before, after = simulated[1][1]["attempts"]
+    pair_bytes = 6 * 4 + 3 * 4 + (6 + 3) * 4  # of lists, of statistics, and of moments and colours, in float32
+    more = after["capacity"] - before["capacity"]
+    assert after["held"] - before["held"] == more * pair_bytes > 0
+    assert before["asked"] == [after["capacity"] * pair_bytes - before["capacity"] * 6 * 4] and after["asked"] == []
+
+
 @pytest.mark.parametrize("place", [0, 1], ids=["that ran", "a million"])
 def test_later_passes_allocate_copy_and_wait_for_nothing(place, simulated):
     first, (forward, backward) = simulated[2][place]

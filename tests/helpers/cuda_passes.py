@@ -8,6 +8,7 @@ import pickle
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
@@ -58,6 +59,7 @@ def make_inputs(case: Case) -> tuple[Gaussians, Camera, dict[str, Any]]:
 
 def run_case(case: Case, capacity: int | None = None) -> dict[str, Any]:
     """The image, the statistics and the gradient, in a second attempt if there was no room in the first."""
+    from minisplat_ref.cuda import tiling
     from minisplat_ref.cuda.arrays import to_device, to_host
     from minisplat_ref.cuda.passes import Options, Passes
 
@@ -71,7 +73,11 @@ def run_case(case: Case, capacity: int | None = None) -> dict[str, Any]:
         v = passes.render_vjp(tape, *map(to_device, given["v"]))
         output = to_host(tape.output._replace(extras={}))
         found = {"output": output, "radii": to_host(tape.footprints.radii), "v": to_host(v)}
-        attempts.append({**found, "n_pairs": passes.count_pairs(tape), "capacity": tape.capacity})
+        held = sum(array.size * array.dtype.itemsize for array in passes._workspace._memory.values())
+        with patch.object(tiling, "check_room") as room:
+            n_pairs = passes.count_pairs(tape)
+        asked = [call.args[0] for call in room.call_args_list]
+        attempts.append({**found, "n_pairs": n_pairs, "capacity": tape.capacity, "held": held, "asked": asked})
         if attempts[-1]["n_pairs"] <= tape.capacity:
             return {**attempts[-1], "attempts": attempts}
 

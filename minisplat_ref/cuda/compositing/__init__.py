@@ -58,7 +58,7 @@ def blend(
     stats_shape, n_slots = (shape, len(lists.ids)) if collects else ((0, 0), 0)
     blended = Blended(
         Pixels(workspace.array("image", (*shape, n_channels), dtype), workspace.array("alpha", shape, dtype)),
-        workspace.array("pair_stats", (n_slots, N_PAIR_STATS), dtype),
+        workspace.array("pair_stats", (n_slots, N_PAIR_STATS), dtype, growth=1),
         workspace.array("median_depth", stats_shape, dtype),
         workspace.array("dominant_ids", stats_shape, np.int32),
     )
