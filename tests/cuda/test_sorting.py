@@ -47,6 +47,12 @@ def test_without_room_the_lists_are_empty_and_the_number_is_right(simulated):
     assert lists.offsets[-1] == enough and not empty.offsets.any()
 
 
+def test_a_block_adds_the_sums_of_those_before_until_one_knows_the_rest(simulated):
+    before, published, is_sum_of_all = simulated[5]
+    assert before == 5 + 20 + 300 and is_sum_of_all
+    assert published == [0, 5, 0, 20, 0, 300, 0, 1325, 0]
+
+
 def tiles_with_a_visible_pixel(box, center, conic, opacity):
     """Tiles under a box in which alpha reaches the threshold at some pixel's centre, as columns and rows of the box."""
     x, y = np.meshgrid(np.arange(box[0], box[2]), np.arange(box[1], box[3]))

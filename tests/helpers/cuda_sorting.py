@@ -75,6 +75,26 @@ def find_reached(boxes, centers, conics, opacities):
     return arrays[4].copy_to_host()
 
 
+def look_back():
+    """The sum before block 3 where only block 0 has the sum of all blocks up to it, and what blocks have published.
+
+    So it is on a card, where blocks run at once; the simulator runs one after another.
+    """
+    from minisplat_ref.cuda.scanning import ALL_SUMS, OWN_SUM, STATE_BITS, sum_before
+    from minisplat_ref.cuda.target import cuda, gpu_kernel, launch
+
+    @gpu_kernel
+    def sum_blocks(counters, found):
+        found[0] = sum_before(counters, 1, 2, 3, 1000)
+
+    counters = np.zeros(9, np.int64)
+    counters[1:7:2] = 5 << STATE_BITS | ALL_SUMS, 20 << STATE_BITS | OWN_SUM, 300 << STATE_BITS | OWN_SUM
+    arrays = cuda.to_device(counters), cuda.to_device(np.zeros(1, np.int64))
+    launch(sum_blocks, 1, 1, *arrays)
+    counters, found = (array.copy_to_host() for array in arrays)
+    return int(found[0]), (counters >> STATE_BITS).tolist(), int(counters[7] & ALL_SUMS) == ALL_SUMS
+
+
 def sort(keys, n_bits):
     """The keys sorted by the kernels, and the order in which they were."""
     from minisplat_ref.cuda import sorting
@@ -126,7 +146,7 @@ def main(path):
     }
     n_pairs = len(bins[70].gaussian_ids)
     rooms = {room: list_with_room_for(room) for room in (n_pairs, n_pairs - 1)}
-    Path(path).write_bytes(pickle.dumps((pairs, bins, orders, rooms, find_reached(*make_ellipses()))))
+    Path(path).write_bytes(pickle.dumps((pairs, bins, orders, rooms, find_reached(*make_ellipses()), look_back())))
 
 
 if __name__ == "__main__":
