@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_tools import published_scenes
-from data_tools.published_scenes import ROWS, SPARSE_VIEWS, cells, main, shortened, thin_out
+from data_tools.published_scenes import FIRST, PAPERS, ROWS, cells, main, shortened, thin_out
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, write_image
 
@@ -30,22 +30,28 @@ def lego(tmp_path):
 
 
 def test_eight_images_are_trained_on_and_every_eighth_is_measured(lego, tmp_path):
-    scene = load_scene(thin_out(lego, tmp_path / "few"))
-    assert sorted(int(view.image[0, 0, 0]) for view in scene.train_views) == sorted(SPARSE_VIEWS)
+    scene = load_scene(thin_out(lego, PAPERS, tmp_path / "few"))
+    assert sorted(int(view.image[0, 0, 0]) for view in scene.train_views) == [2, 16, 26, 55, 73, 75, 86, 93]
     assert [int(view.image[0, 0, 0]) for view in scene.test_views if view.name.endswith("_8")] == [8]
     assert len(scene.test_views) == 25
     by_value = {int(view.image[0, 0, 0]): view.camera.center[0] for view in scene.train_views}
     assert by_value[26] == pytest.approx(0.26)
-    assert thin_out(tmp_path / "nowhere", tmp_path / "few") == tmp_path / "few"  # it is there already
+    assert thin_out(tmp_path / "nowhere", PAPERS, tmp_path / "few") == tmp_path / "few"  # it is there already
+
+
+def test_the_first_eight_images_and_all_test_images(lego, tmp_path):
+    scene = load_scene(thin_out(lego, FIRST, tmp_path / "few"))
+    assert sorted(int(view.image[0, 0, 0]) for view in scene.train_views) == list(range(8))
+    assert len(scene.test_views) == 200
 
 
 def test_another_scene_is_refused(lego, tmp_path):
     with pytest.raises(InputError, match=r"transforms_train\.json is missing"):
-        thin_out(tmp_path, tmp_path / "few")
+        thin_out(tmp_path, PAPERS, tmp_path / "few")
     content = json.loads((lego / "transforms_train.json").read_text())
     (lego / "transforms_train.json").write_text(json.dumps({**content, "frames": content["frames"][:50]}))
     with pytest.raises(InputError, match="has no image r_86"):
-        thin_out(lego, tmp_path / "few")
+        thin_out(lego, PAPERS, tmp_path / "few")
     assert not (tmp_path / "few").exists()
 
 
@@ -64,12 +70,12 @@ def test_a_part_of_the_iterations():
 
 
 def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
-    short = ROWS["lego-8-3dgs-accel"]._replace(options=("--recipe", "3dgs-accel", "--iterations", "2"))
-    monkeypatch.setitem(published_scenes.ROWS, "lego-8-3dgs-accel", short)
-    command = ["lego-8-3dgs-accel", "--data", str(lego), "--out", str(tmp_path / "run")]
+    short = ROWS["lego-first-8-3dgs-accel"]._replace(options=("--recipe", "3dgs-accel", "--iterations", "2"))
+    monkeypatch.setitem(published_scenes.ROWS, "lego-first-8-3dgs-accel", short)
+    command = ["lego-first-8-3dgs-accel", "--data", str(lego), "--out", str(tmp_path / "run")]
     assert main(command) == 0
     printed = capsys.readouterr().out
-    assert "| lego-8-3dgs-accel | 2" in printed and "published: issue 40 of Fictionarry/DNGaussian" in printed
+    assert "| lego-first-8-3dgs-accel | 2" in printed and "published: issue 40 of Fictionarry/DNGaussian" in printed
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     assert main(["lego-8-3dgs", "--data", str(tmp_path / "no"), "--out", str(tmp_path / "b" / "run")]) == 2
