@@ -10,7 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.types import Projection, TileGrid
 
 COUNTED = (0, 31, 32, 70)  # Gaussians; a block has 32
-SORTED = (0, 1, 64, 150)  # keys; a block has 64
+SORTED = (0, 1, 128, 300)  # keys; a block has 128, 64 of each warp
 DEPTHS = (0.5, -2.0, 1e30, -0.0, -1e30, 0.0, -1e-30, 1e-30, -1.0, 3.0)
 BITS = {np.int32: 17, np.int64: 36}
 GRID = TileGrid(400, 340, 16, 16)  # 550 tiles: two digits
