@@ -34,7 +34,11 @@ class Material(NamedTuple):
 
 def linear_rgb(hex_code: str) -> Floats:
     """[3] linear RGB of an sRGB colour such as ``"#e8dcc8"``."""
-    encoded = np.array([int(hex_code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    return decode_srgb(np.array([int(hex_code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0)
+
+
+def decode_srgb(encoded: Floats) -> Floats:
+    """Values of sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
