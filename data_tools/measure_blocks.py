@@ -64,7 +64,7 @@ class Trained(NamedTuple):
         return max(run_folder.read_json_object(part / run_folder.METRICS)["peak_rss_mb"] for part in parts)
 
 
-def compile_kernels(words: list[str]) -> None:
+def train_briefly(words: list[str]) -> None:
     """Train briefly, so that no training's time is that of the compiler."""
     with tempfile.TemporaryDirectory() as folder:
         brief = [*words, "--iterations", "20", "--out", str(Path(folder) / "run")]
@@ -142,7 +142,7 @@ def main() -> None:
     parser.add_argument("--downscale", default="1")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    compile_kernels([args.scene, "--recipe", args.recipe, "--downscale", args.downscale])
+    train_briefly([args.scene, "--recipe", args.recipe, "--downscale", args.downscale])
     rows: dict[str, list[list[float]]] = {}
     fewer: int | None = None
     for seed in args.seeds.split(","):
