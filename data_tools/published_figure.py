@@ -85,15 +85,14 @@ def draw(courses: Sequence[Course], published: float | None, out: Path) -> None:
         for course, color in zip(courses, SERIES, strict=False):
             left.plot(course.steps, course.psnr, color=color, linewidth=1, label=course.name)
             left.plot(course.test_steps, course.test_psnr, "o", color=color)
-            right.plot(course.steps, course.n_gaussians, color=color, label=course.name)
+            right.plot(course.steps, course.n_gaussians, color=color)
         if published is not None:
-            left.axhline(published, color=GREY, linestyle="--", linewidth=1)
-            left.annotate("3DGS, as published", (0, published), va="bottom", fontsize=9, color=GREY)
+            left.axhline(published, color=GREY, linestyle="--", linewidth=1, label=f"3DGS, published: {published:g} dB")
         for axes, title in ((left, "PSNR (dB): lines training views, dots test views"), (right, "Gaussians")):
             axes.set_title(title, fontsize=11, loc="left", color=TITLE_COLOR)
             axes.set_xlabel("iterations")
         right.set_yscale("log")
-        right.legend()
+        left.legend(loc="lower right")
         with replacing(out) as path:
             figure.savefig(path, dpi=PNG_DPI, format="png")
 
