@@ -27,7 +27,7 @@ from minisplat_ref.cuda.target import (
 
 DIGIT_BITS = 8
 N_DIGITS = 1 << DIGIT_BITS
-THREADS, ROUNDS = (2 * WARP, 2) if is_simulated else (256, 16)  # of a block; simulated ones are Python threads
+THREADS, ROUNDS = (2 * WARP, 2) if is_simulated else (256, 16)  # of a block; the simulator has two warps
 N_WARPS = THREADS // WARP
 N_WARP_SUMS = N_WARPS + 1  # of the warps of a block, and of all of them
 BLOCK_KEYS = THREADS * ROUNDS
