@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from data_tools.claims import kit
 from minisplat_ref.app.runs.opened_run import Run, open_run
 from minisplat_ref.datasets.synthetic.materials import decode_srgb
 from minisplat_ref.errors import InputError
@@ -84,8 +85,7 @@ def measure(run: Run, data: Path) -> Angles:
         depth = expected_depth(output.image[..., 3], output.alpha).astype(np.float64)
         found = central_normals(depth, view.camera) @ view.camera.cam_from_world_R
         is_counted = known.is_known & (output.alpha > ALPHA_MIN) & found.any(axis=2)
-        cosines = np.sum(found[is_counted] * known.normals[is_counted], axis=1)
-        angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+        angles.append(kit.angles(found[is_counted], known.normals[is_counted]))
         n_covered += int(known.is_covered.sum())
     together = np.concatenate(angles) if angles else np.zeros(0)
     if not len(together):

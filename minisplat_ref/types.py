@@ -7,7 +7,7 @@ camera frames are right-handed; camera axes are OpenCV's: x right, y down, z for
 right and y down, and the centre of the top-left pixel is (0.5, 0.5).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -138,6 +138,12 @@ class View(NamedTuple):
 def number_views(views: Iterable[View]) -> tuple[View, ...]:
     """Return training views with their indices as ``view_id``."""
     return tuple(view._replace(view_id=i) for i, view in enumerate(views))
+
+
+def some_views(views: Sequence[View], n: int) -> list[View]:
+    """Return at most ``n`` of the views, spread evenly over the list from the first to the last."""
+    rows = np.linspace(0, len(views) - 1, min(len(views), n)).round().astype(int)
+    return [views[row] for row in rows]
 
 
 def view_from(camera: Camera, *, name: str = "", time: float = 0.0) -> View:

@@ -207,8 +207,7 @@ def compare(views: list[Truth], images: list[Floats]) -> dict[str, float]:
         if centres[0] is not None and centres[1] is not None:
             offsets.append(np.linalg.norm(centres[0] - centres[1]))
         normals = image[truth.is_sphere][:, 3:6] @ truth.camera.cam_from_world_R
-        cosines = np.sum(normals * truth.normals, axis=1) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
-        angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean())
+        angles.append(kit.angles(normals, truth.normals).mean())
     return {
         "psnr": float(-10 * np.log10(np.mean(errors))),
         "highlight": float(np.mean(offsets)) if offsets else float("nan"),

@@ -70,8 +70,7 @@ def outcome(made: SyntheticScene, iterations: int, arm: str, seed: int) -> dict[
         depth_errors.append((np.abs(depth - truth) / np.where(truth > 0, truth, 1))[is_counted])
         n = central_normals(depth.astype(np.float64), view.camera) @ view.camera.cam_from_world_R
         has_normal = is_counted & (np.abs(n).sum(axis=2) > 0)
-        cosines = np.sum(n * normals, axis=2)[has_normal]
-        angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+        angles.append(kit.angles(n[has_normal], normals[has_normal]))
     return {
         "depth_error": 100 * float(np.median(np.concatenate(depth_errors))),
         "normal_error": float(np.median(np.concatenate(angles))),

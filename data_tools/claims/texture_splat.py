@@ -201,7 +201,7 @@ def compare(test: list[Maps], albedo: tuple[Floats, ...], normals: tuple[Floats,
         known = maps.is_known
         errors["albedo"].append((a - maps.materials[:, :, :3])[known] ** 2)
         errors["normals"].append(((n - maps.normals)[known] / 2) ** 2)
-        errors["angle"].append(np.degrees(np.arccos(np.clip(np.sum(n * maps.normals, axis=2)[known], -1, 1))))
+        errors["angle"].append(kit.angles(n[known], maps.normals[known]))
     return {
         "albedo_psnr": float(-10 * np.log10(np.concatenate(errors["albedo"]).mean())),
         "normal_psnr": float(-10 * np.log10(np.concatenate(errors["normals"]).mean())),

@@ -249,6 +249,20 @@ def psnr_of(image: Floats, target: Floats) -> float:
     return float(-10 * np.log10(np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2)))
 
 
+def angles(found: Floats, truth: Floats) -> Floats:
+    """Return the angle in degrees between each direction found and the true one, [...].
+
+    Parameters
+    ----------
+    found : (..., 3) array
+        Of any length; 90 degrees where it is 0.
+    truth : (..., 3) array
+        Of unit length.
+    """
+    cosines = np.sum(found * truth, axis=-1) / np.maximum(np.linalg.norm(found, axis=-1), 1e-12)
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
 def min_seconds(function: Callable[[], Any], repeats: int) -> float:
     """Return the least processor time of a call, summed over all threads, seconds."""
     times = []

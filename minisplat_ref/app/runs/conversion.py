@@ -26,7 +26,7 @@ from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
-from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Ints, Model, number_views
+from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Ints, Model, number_views, some_views
 
 VIEWS_MAX = 24
 OUTLIER_REACH = 1000.0  # extents of most of a scene; a sky of Gaussians is less than a hundred away
@@ -356,9 +356,7 @@ def make_judge(source: Source, path: Path, scene: Path | None, downscale: int | 
         photographs = place_scene(load_scene(scene, downscale=downscale or 1, undistort=True), source.frame)
     else:
         raise InputError(f"--max-drop needs photographs to measure on, and {path} is no run: give --scene PATH")
-    n = len(photographs.train_views)
-    rows = np.unique(np.linspace(0, n - 1, min(n, VIEWS_MAX)).round().astype(int))
-    views = [photographs.train_views[row] for row in rows]
+    views = some_views(photographs.train_views, VIEWS_MAX)
 
     def measure_psnr(gaussians: Gaussians) -> float:
         psnr = evaluate(
@@ -371,4 +369,4 @@ def make_judge(source: Source, path: Path, scene: Path | None, downscale: int | 
         assert psnr is not None
         return psnr
 
-    return Judge(measure_psnr, f"{len(views)} of {n} training views of {photographs.name}")
+    return Judge(measure_psnr, f"{len(views)} of {len(photographs.train_views)} training views of {photographs.name}")

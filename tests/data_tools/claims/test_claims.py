@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import minisplat_ref
-from data_tools.claims import all_claims
+from data_tools.claims import all_claims, kit
 from data_tools.claims import depth as depth_types
 from data_tools.claims.__main__ import main as measure_claim
 from measured_claims import read_result
@@ -141,3 +141,10 @@ def test_interrupted_claim_leaves_nothing(tmp_path, capsys, monkeypatch):
     assert measure_claim(["depth", "room", "--out", str(tmp_path / "out")]) == 130
     assert "data_tools.claims: interrupted\n" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
+
+
+def test_angles_between_directions():
+    """Hand-worked: a right angle, 60 degrees between directions of other lengths, opposite ones, and no direction."""
+    found = np.array([[0, 0, 2.0], [1, 1, 0], [-3, 0, 0], [0, 0, 0]])
+    truth = np.array([[1.0, 0, 0], [0, 0.5**0.5, 0.5**0.5], [1, 0, 0], [0, 1, 0]])
+    assert kit.angles(found, truth) == pytest.approx([90, 60, 180, 90])
