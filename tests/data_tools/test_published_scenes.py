@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from data_tools import published_scenes
-from data_tools.published_scenes import FIRST, PAPERS, ROWS, cells, main, shortened, thin_out
+from data_tools.few_images import FIRST, PAPERS, THREE, thin_out
+from data_tools.published_scenes import ROWS, cells, main, shortened
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, write_image
 
@@ -52,6 +53,38 @@ def test_another_scene_is_refused(lego, tmp_path):
     (lego / "transforms_train.json").write_text(json.dumps({**content, "frames": content["frames"][:50]}))
     with pytest.raises(InputError, match="has no image r_86"):
         thin_out(lego, PAPERS, tmp_path / "few")
+    assert not (tmp_path / "few").exists()
+
+
+def write_fern(path):
+    """Twenty photographs of 12 x 16 pixels, each with its own gray value, whose cameras have its number as x."""
+    rows = []
+    for k in range(20):
+        down, right, backward = [0.0, -1, 0], [1.0, 0, 0], [0.0, 0, 1]
+        rows.append([*np.column_stack([down, right, backward, [k, 0, 0], [96, 128, 100]]).ravel(), 1.0, 9.0])
+        (path / "images_4").mkdir(parents=True, exist_ok=True)
+        write_image(path / "images_4" / f"image{k:03}.png", np.full((12, 16, 3), 10 * k, np.uint8))
+    np.save(path / "poses_bounds.npy", np.array(rows))
+    return path
+
+
+def test_three_photographs_of_fern_are_trained_on_and_the_published_ones_measured(tmp_path):
+    """Held out are 0, 8 and 16; of the others, 1 2 3 4 5 6 7 9 10 ... 19, the first, ninth and last remain."""
+    fern = write_fern(tmp_path / "fern")
+    scene = load_scene(thin_out(fern, THREE, tmp_path / "few"), test_every=2)
+    for views, numbers in ((scene.train_views, [1, 10, 19]), (scene.test_views, [0, 8, 16])):
+        assert [int(view.image[0, 0, 0]) // 10 for view in views] == numbers
+        assert [view.camera.center[0] for view in views] == numbers
+        assert {view.image.shape for view in views} == {(12, 16, 3)}
+    held_out = {view.name for view in load_scene(fern, test_every=8).test_views}
+    assert held_out == {view.name for view in scene.test_views}
+
+
+def test_a_fern_without_its_photographs_is_refused(tmp_path):
+    fern = write_fern(tmp_path / "fern")
+    (fern / "images_4" / "image019.png").unlink()
+    with pytest.raises(InputError, match=r"images_4 has 19 files, and poses_bounds\.npy 20 rows: it is not fern"):
+        thin_out(fern, THREE, tmp_path / "few")
     assert not (tmp_path / "few").exists()
 
 
