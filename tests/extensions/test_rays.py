@@ -19,7 +19,16 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import model
-from minisplat_ref.extensions.rays.model import TRACED, Whitened, make_tracer, stages, whiten, whiten_model, whiten_vjp
+from minisplat_ref.extensions.rays.model import (
+    TRACED,
+    Whitened,
+    make_image_tracer,
+    make_tracer,
+    stages,
+    whiten,
+    whiten_model,
+    whiten_vjp,
+)
 from minisplat_ref.mechanisms.rays import bvh as bvh
 from minisplat_ref.mechanisms.rays.blending import sum_by_row
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays, pixel_rays_vjp
@@ -283,7 +292,8 @@ def bare(rng):
         rays = pixel_rays(camera, conventions)
         images = []
         for backend in (CPU, REFERENCE):
-            tracer, ones = make_tracer(gaussians, conventions, backend), np.ones((len(gaussians.means), 3))
+            tracer = make_image_tracer(gaussians, camera, conventions, backend)
+            ones = np.ones((len(gaussians.means), 3))
             blended = tracer.blend(ones, rays, BLACK, conventions)
             v = tracer.blend_vjp(ones, rays, BLACK, conventions, blended, (blended.image, rays.near, rays.near))
             assert all(np.isfinite(array).all() for array in (*blended[:5], *v))

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from data_tools.claims import kit
 from data_tools.claims.kit.figures import set_ticks, show, subplots, table_of
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.polygons.kernels import TRIANGLE, Fans, build_tree
+from minisplat_ref.extensions.polygons.kernels import Fans, build_tree, meet
 from minisplat_ref.extensions.polygons.model import TRACED
 from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, make_soup
 from minisplat_ref.interface.palette import BLUE, GREY, OCHRE, RED
@@ -128,7 +128,7 @@ def render_soup(gaussians: Gaussians, soup: Soup, corners: Floats) -> Floats:
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits[soup.rows]))
     fans = Fans(centres, corners - centres[:, None], soup.radii, opacities)
     colors = np.maximum(0, 0.5 + SH_C0 * gaussians.sh_dc[soup.rows])
-    tracer = tracer_of(TRIANGLE, build_tree(fans, GSPLAT_MAIN))
+    tracer = tracer_of(meet, build_tree(fans, GSPLAT_MAIN))
     return tracer.blend(colors, pixel_rays(camera(), GSPLAT_MAIN), np.ones(3), GSPLAT_MAIN).image.reshape(SIZE, SIZE, 3)
 
 

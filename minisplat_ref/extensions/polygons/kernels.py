@@ -25,7 +25,6 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, select
 from minisplat_ref.mechanisms.rays.bvh import build
-from minisplat_ref.mechanisms.rays.kernels import RayResponse
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
 from minisplat_ref.types import Floats
 
@@ -70,7 +69,7 @@ def build_tree(fans: Fans, conventions: Conventions) -> RayTree:
     records[:, CENTRE:E1] = fans.centres[ids]
     records[:, E1:E2] = fans.spokes[ids, parts]
     records[:, E2:] = fans.spokes[ids, (parts + 1) % n_sides]
-    return RayTree(records, ids.astype(np.int32), parts.astype(np.int32), tree.boxes, tree.children, n)
+    return RayTree(records, ids.astype(np.int32), tree.boxes, tree.children, n)
 
 
 @scalar
@@ -110,41 +109,3 @@ def meet(records, row, ray):
     q = records[row, SQUARE] * (b1 * b1 + b2 * b2 + 2.0 * records[row, COSINE] * b1 * b2)
     most = select(b2 > 0.0, broadcast(1.0), records[row, OWN])
     return t, select((b1 >= 0.0) & (b2 >= 0.0) & (b1 + b2 <= most), q, np.inf)
-
-
-@scalar
-def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
-    """Return the gradient with respect to the centre, the direction, and both edges [6].
-
-    ``K y = s`` with ``K = [-d, e_1, e_2]`` and ``y = (t, b_1, b_2)``, so ``v_s = K^-T v_y`` and ``v_K = -v_s y^T``.
-    That of r is left out: the edges grow with it, and alpha at a place does not depend on it.
-    """
-    t, b1, b2, D = intersect(records, row, ray)
-    d = ray[3], ray[4], ray[5]
-    e1, e2, n = edges(records, row)
-    k = -records[row, SQUARE] * unclamped * v_unclamped
-    v_b1, v_b2 = k * (b1 + records[row, COSINE] * b2), k * (b2 + records[row, COSINE] * b1)
-    f, g = cross(d, e2), cross(e1, d)
-    x = (v_t * n[0] + v_b1 * f[0] + v_b2 * g[0]) / D
-    y = (v_t * n[1] + v_b1 * f[1] + v_b2 * g[1]) / D
-    z = (v_t * n[2] + v_b1 * f[2] + v_b2 * g[2]) / D
-    return (-x, -y, -z), (t * x, t * y, t * z), (-b1 * x, -b1 * y, -b1 * z, -b2 * x, -b2 * y, -b2 * z)
-
-
-def _sum_spans(tree: RayTree, v_edges: Floats) -> Floats:
-    """Return the gradient of the spans [N, 3, 2] from those of the triangles' edges [N', 6].
-
-    The edges of triangle j are ``r S (cos phi, sin phi)^T`` at the angles ``phi_j`` and ``phi_j+1``.
-    """
-    r, step = np.sqrt(tree.records[:, SQUARE]), np.arccos(tree.records[:, COSINE])
-    v_spans = np.zeros((tree.n, 3, 2))
-    for edge in range(2):
-        phi = (tree.parts + edge) * step
-        directions = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])  # [N', 2]
-        v_edge = v_edges[:, 3 * edge : 3 * edge + 3]
-        np.add.at(v_spans, tree.gaussian_ids, v_edge[:, :, None] * directions[:, None, :])
-    return v_spans
-
-
-TRIANGLE = RayResponse(meet, meet_vjp, 6, _sum_spans)
-"""A triangle of the fan of a flat Gaussian."""

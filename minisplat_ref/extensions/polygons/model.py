@@ -12,7 +12,8 @@ It hits the polygon of n sides and radius r if it is on the inner side of every 
 
 A polygon of radius 0 is never hit. The edge has no gradient: at most ``o exp(-(r cos(pi / n))^2 / 2)`` of alpha ends
 there, 0.008 for an octagon of opacity 1. In NumPy every ray is evaluated with every polygon, and
-``mechanisms.rays.blending`` blends the hits; the kernels (:mod:`.ray_kernels`) look them up in a tree.
+``mechanisms.rays.blending`` blends the hits; the kernels (:mod:`.ray_kernels`) look them up in the
+lists of an image's tiles, or in a tree.
 """
 
 from collections.abc import Mapping
@@ -24,12 +25,14 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.polygons.kernels import Fans
 from minisplat_ref.extensions.polygons.ray_kernels import POLYGON, make_records
 from minisplat_ref.mechanisms.meshes.fans import N_SIDES, flatten, opacity_radii, plane_axes, rims, turn_balls
-from minisplat_ref.mechanisms.rays import blending, kernels
+from minisplat_ref.mechanisms.rays import blending, kernels, tile_kernels
 from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.bvh import build
 from minisplat_ref.mechanisms.rays.gradient_checks import trace_stages
-from minisplat_ref.mechanisms.rays.pixel_rays import Rays, Tracer
+from minisplat_ref.mechanisms.rays.pixel_rays import ImageTracer, Rays, Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, make_ray_renderer
+from minisplat_ref.mechanisms.rays.tile_kernels import InImage
+from minisplat_ref.mechanisms.rays.tile_lists import Ellipsoids, list_tiles
 from minisplat_ref.mechanisms.rays.traversal import RayTree
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.setting import Setting
@@ -37,7 +40,7 @@ from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.covariance import rotation_matrices_vjp
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Bools, Floats, Gaussians, Ints
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints
 
 LOG_THICKNESS = float(np.log(1e-5))  # of the axis across, as in the paper; rendering has none
 
@@ -206,28 +209,47 @@ def make_fans(polygons: Polygons) -> Fans:
     return Fans(polygons.means, spokes, polygons.radii, polygons.opacities)
 
 
+def find_ellipsoids(polygons: Polygons, conventions: Conventions) -> Ellipsoids:
+    """Return the ellipses around polygons, of a smaller reach q where alpha falls below ``alpha_min`` inside.
+
+    The reach of polygons that are too faint, empty or not finite is below 0.
+    """
+    least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        reaches = np.minimum(2 * np.log(polygons.opacities / least), polygons.radii**2)
+        squares = np.sum(polygons.spans**2, axis=1)  # [N, 2]
+    is_seen = (polygons.radii > 0) & (squares > 0).all(axis=1) & np.isfinite(squares).all(axis=1)
+    axes = np.ascontiguousarray(np.swapaxes(polygons.spans, 1, 2))
+    return Ellipsoids(polygons.means, axes, np.where(is_seen, reaches, -np.inf))
+
+
 def build_tree(polygons: Polygons, conventions: Conventions) -> RayTree:
     """Return the polygons with their tree; those that are too faint, empty or not finite are left out."""
     fans = make_fans(polygons)
     corners = fans.centres[:, None] + fans.spokes  # [N, n, 3]
-    is_seen = (polygons.radii > 0) & (polygons.opacities >= max(conventions.alpha_min, np.finfo(np.float64).tiny))
-    with np.errstate(over="ignore"):
-        squares = np.sum(polygons.spans**2, axis=1)  # [N, 2]
-    seen = np.flatnonzero(is_seen & np.isfinite(corners).all(axis=(1, 2)) & (squares > 0).all(axis=1))
+    is_seen = find_ellipsoids(polygons, conventions).reaches >= 0
+    seen = np.flatnonzero(is_seen & np.isfinite(corners).all(axis=(1, 2)))
     tree = build(corners[seen].min(axis=1), corners[seen].max(axis=1))
     ids = seen[tree.rows]
-    records = make_records(
-        polygons.means[ids], polygons.spans[ids], polygons.radii[ids], polygons.opacities[ids], polygons.n_sides
-    )
-    parts = np.zeros(len(ids), np.int32)
-    return RayTree(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(polygons.means))
+    records = make_records(*(field[ids] for field in polygons[:4]), polygons.n_sides)
+    return RayTree(records, ids.astype(np.int32), tree.boxes, tree.children, len(polygons.means))
 
 
 def make_tracer(polygons: Polygons, conventions: Conventions, backend: Backend) -> Tracer:
     """Return the tracer of a backend: every ray against every polygon, or kernels with a tree of polygons."""
     if backend.is_compiled:
-        return kernels.tracer_of(POLYGON, build_tree(polygons, conventions))
+        return kernels.tracer_of(POLYGON.meet, build_tree(polygons, conventions))
     return blending.tracer_of(prepare_meeting(polygons))
+
+
+def make_image_tracer(
+    polygons: Polygons, camera: Camera, conventions: Conventions, backend: Backend
+) -> ImageTracer:
+    """Return the tracer of a camera's image: every ray against every polygon, or kernels with lists of its tiles."""
+    if backend.is_compiled:
+        lists = list_tiles(find_ellipsoids(polygons, conventions), camera, conventions)
+        return tile_kernels.tracer_of(InImage(POLYGON, lists, make_records(*polygons)))
+    return blending.image_tracer_of(prepare_meeting(polygons))
 
 
 def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
@@ -241,7 +263,7 @@ def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
 TRACED = Representation(
     "flat Gaussians in polygons",
     extend=press_flat,
-    renderer=make_ray_renderer(Traced("polygons", make_polygons, make_tracer, spans_vjp)),
+    renderer=make_ray_renderer(Traced("polygons", make_polygons, make_image_tracer, spans_vjp)),
 )
 
 POLYGONS = GS_ACCEL._replace(name="polygons")

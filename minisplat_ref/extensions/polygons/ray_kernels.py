@@ -10,8 +10,8 @@ import numpy as np
 from minisplat_ref.extensions.polygons.kernels import cross, dot
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
-from minisplat_ref.mechanisms.rays.kernels import RayResponse
-from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
+from minisplat_ref.mechanisms.rays.tile_kernels import RayResponse
+from minisplat_ref.mechanisms.rays.traversal import OPACITY
 from minisplat_ref.types import Floats
 
 N_SIDES, INNER = 1, 2  # columns of a record beside the opacity: n, and r cos(pi / n), from the centre to an edge
@@ -99,12 +99,10 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return v_m, (-t * v_m[0], -t * v_m[1], -t * v_m[2]), v_spans
 
 
-def _sum_spans(tree: RayTree, v_rows: Floats) -> Floats:
-    """Return the gradient of the spans [N, 3, 2] from those of the rows [N', 6], each of which is one polygon."""
-    v: Floats = np.zeros((tree.n, 3, 2))
-    v[tree.gaussian_ids] = np.swapaxes(v_rows.reshape(-1, 2, 3), 1, 2)
-    return v
+def _as_spans(v: Floats) -> Floats:
+    """Return the gradient of spans as [N, 3, 2]."""
+    return np.swapaxes(v.reshape(-1, 2, 3), 1, 2)
 
 
-POLYGON = RayResponse(meet, meet_vjp, 6, _sum_spans)
+POLYGON = RayResponse(meet, meet_vjp, 6, _as_spans)
 """A flat Gaussian in its polygon."""

@@ -1,15 +1,14 @@
 """One ray and one 3D Gaussian as kernels read them: the formulas of :mod:`.model`.
 
-The loops, from a ray's way through the tree to the gradient, are those of ``mechanisms.rays.traversal`` and
-``mechanisms.rays.kernels``.
+The loops are those of ``mechanisms.rays.tile_kernels`` for the rays of an image, and of ``mechanisms.rays.traversal``
+and ``mechanisms.rays.kernels`` for any others.
 """
 
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import select
-from minisplat_ref.mechanisms.rays.kernels import RayResponse
-from minisplat_ref.mechanisms.rays.traversal import RayTree
+from minisplat_ref.mechanisms.rays.tile_kernels import RayResponse
 from minisplat_ref.types import Floats
 
 REACH, MEAN, MAP = 1, 2, 5  # columns of a record beside the opacity
@@ -83,12 +82,10 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return back(records, row, of_p), back(records, row, of_v), of_map
 
 
-def _sum_maps(tree: RayTree, v_maps: Floats) -> Floats:
-    """Return the gradient of each Gaussian's map [N, 3, 3] from those of the rows [N', 9], each of which is one."""
-    v: Floats = np.zeros((tree.n, 3, 3))
-    v[tree.gaussian_ids] = v_maps.reshape(-1, 3, 3)
-    return v
+def _as_maps(v: Floats) -> Floats:
+    """Return the gradient of maps as [N, 3, 3]."""
+    return v.reshape(-1, 3, 3)
 
 
-RESPONSE = RayResponse(meet, meet_vjp, 9, _sum_maps)
+RESPONSE = RayResponse(meet, meet_vjp, 9, _as_maps)
 """A 3D Gaussian where its density on the ray is greatest."""

@@ -9,7 +9,8 @@ This is section 3 of RaySplats. The map ``M = diag(1/s) R^T`` takes the Gaussian
     alpha = min(alpha_max, o exp(-q / 2))
 
 The maps are of the size of the population, and both backends use them. Here every ray is evaluated with every Gaussian,
-and ``mechanisms.rays.blending`` blends the hits; the kernels (:mod:`.kernels`) look them up in a tree.
+and ``mechanisms.rays.blending`` blends the hits; the kernels (:mod:`.kernels`) look them up in
+the lists of an image's tiles, or in a tree.
 """
 
 from collections.abc import Mapping
@@ -19,12 +20,14 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.kernels import MAP, MEAN, N_COLUMNS, REACH, RESPONSE
-from minisplat_ref.mechanisms.rays import blending, kernels
+from minisplat_ref.mechanisms.rays import blending, kernels, tile_kernels
 from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.bvh import SLACK, build
 from minisplat_ref.mechanisms.rays.gradient_checks import trace_stages
-from minisplat_ref.mechanisms.rays.pixel_rays import Rays, Tracer
+from minisplat_ref.mechanisms.rays.pixel_rays import ImageTracer, Rays, Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, make_ray_renderer
+from minisplat_ref.mechanisms.rays.tile_kernels import InImage
+from minisplat_ref.mechanisms.rays.tile_lists import Ellipsoids, list_tiles
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.oracle.setting import Setting
@@ -32,7 +35,7 @@ from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Bools, Floats, Ints, Model
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Model
 
 
 class Whitened(NamedTuple):
@@ -178,26 +181,39 @@ def prepare_meeting(gaussians: Whitened) -> Meeting:
     return Meeting(len(gaussians.means), alphas_and_depths, lambda *args: intersect_vjp(gaussians, *args))
 
 
-def build_tree(gaussians: Whitened, conventions: Conventions) -> RayTree:
-    """Return Gaussians with their tree, without those that are too faint or not finite."""
-    # Half-extents of the ellipsoid |M x|^2 = q: Sigma = M^-1 M^-T, and row i of M is R_i / s_i.
+def find_ellipsoids(gaussians: Whitened, conventions: Conventions) -> Ellipsoids:
+    """Return the ellipsoids ``|M x|^2 = q`` on which alpha is ``alpha_min``: ``Sigma = M^-1 M^-T``, row i of M is
+    ``R_i / s_i``. The reach q of Gaussians that are too faint or not finite is not above 0.
+    """
     least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        reaches = 2 * np.log(gaussians.opacities / least)  # q
+        reaches = 2 * np.log(gaussians.opacities / least)
         inverse_variances = np.sum(gaussians.maps**2, axis=2)  # [N, 3] 1 / s^2
         axes = gaussians.maps / inverse_variances[:, :, None]  # [N, 3, 3] s_i R_i
+    return Ellipsoids(gaussians.means, axes, np.where(np.isfinite(inverse_variances).all(axis=1), reaches, -np.inf))
+
+
+def make_records(gaussians: Whitened, reaches: Floats) -> Floats:
+    """Return the records [N, N_COLUMNS] of Gaussians and their reaches."""
+    records = np.empty((len(reaches), N_COLUMNS))
+    records[:, OPACITY] = gaussians.opacities
+    records[:, REACH] = reaches + SLACK
+    records[:, MEAN:MAP] = gaussians.means
+    records[:, MAP:] = gaussians.maps.reshape(-1, 9)
+    return records
+
+
+def build_tree(gaussians: Whitened, conventions: Conventions) -> RayTree:
+    """Return Gaussians with their tree, without those that are too faint or not finite."""
+    _, axes, reaches = find_ellipsoids(gaussians, conventions)
+    with np.errstate(invalid="ignore", over="ignore"):
         half = np.sqrt(reaches[:, None] * np.sum(axes**2, axis=1))  # [N, 3]
-        is_finite = np.isfinite(gaussians.means).all(axis=1) & np.isfinite(half).all(axis=1)
-    seen = np.flatnonzero(is_finite & np.isfinite(inverse_variances).all(axis=1) & (reaches >= 0))
+    is_finite = np.isfinite(gaussians.means).all(axis=1) & np.isfinite(half).all(axis=1)
+    seen = np.flatnonzero(is_finite & (reaches >= 0))
     tree = build(gaussians.means[seen] - half[seen], gaussians.means[seen] + half[seen])
     ids = seen[tree.rows]
-    records = np.empty((len(ids), N_COLUMNS))
-    records[:, OPACITY] = gaussians.opacities[ids]
-    records[:, REACH] = reaches[ids] + SLACK
-    records[:, MEAN:MAP] = gaussians.means[ids]
-    records[:, MAP:] = gaussians.maps[ids].reshape(-1, 9)
-    parts = np.zeros(len(ids), np.int32)
-    return RayTree(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(gaussians.means))
+    records = make_records(Whitened(*(field[ids] for field in gaussians)), reaches[ids])
+    return RayTree(records, ids.astype(np.int32), tree.boxes, tree.children, len(gaussians.means))
 
 
 def whiten_model(model: Model) -> Whitened:
@@ -210,8 +226,19 @@ def whiten_model(model: Model) -> Whitened:
 def make_tracer(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
     """Return the tracer of a backend: every ray against every Gaussian, or kernels with a tree, which is built here."""
     if backend.is_compiled:
-        return kernels.tracer_of(RESPONSE, build_tree(gaussians, conventions))
+        return kernels.tracer_of(RESPONSE.meet, build_tree(gaussians, conventions))
     return blending.tracer_of(prepare_meeting(gaussians))
+
+
+def make_image_tracer(
+    gaussians: Whitened, camera: Camera, conventions: Conventions, backend: Backend
+) -> ImageTracer:
+    """Return the tracer of a camera's image: every ray against every Gaussian, or kernels with lists of its tiles."""
+    if backend.is_compiled:
+        ellipsoids = find_ellipsoids(gaussians, conventions)
+        lists = list_tiles(ellipsoids, camera, conventions)
+        return tile_kernels.tracer_of(InImage(RESPONSE, lists, make_records(gaussians, ellipsoids.reaches)))
+    return blending.image_tracer_of(prepare_meeting(gaussians))
 
 
 def _prepare(population: Any, opacities: Floats) -> Whitened:
@@ -223,7 +250,7 @@ def _shapes_vjp(population: Any, gaussians: Whitened, v_maps: Floats) -> tuple[F
 
 
 TRACED = Representation(
-    "gaussians traced by rays", renderer=make_ray_renderer(Traced("rays", _prepare, make_tracer, _shapes_vjp))
+    "gaussians traced by rays", renderer=make_ray_renderer(Traced("rays", _prepare, make_image_tracer, _shapes_vjp))
 )
 
 RAYS = GS_ACCEL._replace(name="rays")

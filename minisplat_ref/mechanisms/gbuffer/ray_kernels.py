@@ -31,7 +31,7 @@ def tree_of(records: Floats, conventions: Conventions) -> RayTree:
     half = np.sqrt(reach2[:, None] * (squares[0] + squares[1]))
     tree = build(kept[:, CENTRE:U] - half, kept[:, CENTRE:U] + half)
     ids = seen[tree.rows].astype(np.int32)
-    return RayTree(kept[tree.rows], ids, np.zeros_like(ids), tree.boxes, tree.children, len(records))
+    return RayTree(kept[tree.rows], ids, tree.boxes, tree.children, len(records))
 
 
 @scalar

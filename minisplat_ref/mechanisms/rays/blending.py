@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
+from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, ImageTracer, RayGradient, Rays, Tracer
 from minisplat_ref.reference.hits import is_accepted
 from minisplat_ref.types import Floats, Ints
 
@@ -48,8 +48,13 @@ class Meeting(NamedTuple):
 
 
 def tracer_of(meeting: Meeting) -> Tracer:
-    """Return the three functions of tracing."""
-    return Tracer(partial(list_hits, meeting), partial(blend_rays, meeting), partial(blend_rays_vjp, meeting))
+    """Return the functions of tracing any rays."""
+    return Tracer(partial(list_hits, meeting), partial(blend_rays, meeting))
+
+
+def image_tracer_of(meeting: Meeting) -> ImageTracer:
+    """Return the functions of tracing the rays of a camera; here it does not matter which."""
+    return ImageTracer(*tracer_of(meeting), partial(blend_rays_vjp, meeting))
 
 
 def list_hits(meeting: Meeting, rays: Rays, conventions: Conventions) -> Hits:

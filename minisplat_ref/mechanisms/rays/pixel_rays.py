@@ -3,7 +3,6 @@
 All floats are float64: a thin Gaussian far away leaves float32 no digit of its distance. P rays, N Gaussians, H hits.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -83,12 +82,21 @@ class RayGradient(NamedTuple):
 
 
 class Tracer(NamedTuple):
-    """The three functions of tracing for one population, by a backend."""
+    """The functions of tracing any rays through one population, by a backend."""
 
     list_hits: Callable[[Rays, Conventions], Hits]
     """``list_hits(rays, conventions)``: the blended hits of each ray."""
     blend: Callable[[Floats, Rays, Floats, Conventions], BlendedRays]
     """``blend(colors, rays, background, conventions)``: the blended values of each ray."""
+
+
+class ImageTracer(NamedTuple):
+    """The functions of tracing the rays of :func:`pixel_rays` of one camera through one population, by a backend."""
+
+    list_hits: Callable[[Rays, Conventions], Hits]
+    """As of :class:`Tracer`."""
+    blend: Callable[[Floats, Rays, Floats, Conventions], BlendedRays]
+    """As of :class:`Tracer`."""
     blend_vjp: Callable[..., RayGradient]
     """``blend_vjp(colors, rays, background, conventions, blended, v_blended)``: the gradient of that, with derivatives
     with respect to the image [P, 3], the depths [P] and the transmittances [P]."""
@@ -104,13 +112,6 @@ def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
     origins = np.broadcast_to(camera.center, directions.shape)
     limits = (np.full(len(directions), plane) for plane in (conventions.near_plane, conventions.far_plane))
     return Rays(np.ascontiguousarray(origins), directions, *limits)
-
-
-@functools.cache
-def block_order(width: int, height: int) -> Ints:
-    """Return the pixels [H W] in blocks of 4 x 2, since eight rays that traverse a tree together should be adjacent."""
-    ys, xs = np.divmod(np.arange(width * height), width)
-    return np.lexsort((xs, ys, xs // 4, ys // 2))
 
 
 def pixel_rays_vjp(

@@ -13,10 +13,9 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.rays.pixel_rays import (
     BlendedRays,
+    ImageTracer,
     Rays,
-    Tracer,
     blend_stats,
-    block_order,
     pixel_rays,
     pixel_rays_vjp,
 )
@@ -35,8 +34,8 @@ class Traced(NamedTuple):
     prepare: Callable[[Any, Floats], Any]
     """``prepare(population, opacities)``: the Gaussians as rays meet them, of opacities [N] in float64, 0 where one is
     not rendered."""
-    tracer_for: Callable[[Any, Conventions, Backend], Tracer]
-    """``tracer_for(prepared, conventions, backend)``: the tracer of a backend; trees are built here."""
+    tracer_for: Callable[[Any, Camera, Conventions, Backend], ImageTracer]
+    """``tracer_for(prepared, camera, conventions, backend)``: the tracer of a backend; lists are made here."""
     shapes_vjp: Callable[[Any, Any, Floats], tuple[Floats, Floats]]
     """``shapes_vjp(population, prepared, v_shapes)``: the gradient with respect to quaternions [N, 4] and logarithms of
     scales [N, 3]."""
@@ -56,9 +55,8 @@ class _Tape(NamedTuple):
     traced: Traced
     opacities: Floats  # [N]
     prepared: Any
-    tracer: Tracer
-    order: Ints  # [H W] pixels in the order of the rays
-    rays: Rays
+    tracer: ImageTracer
+    rays: Rays  # [H W] row by row
     colors: Floats  # [N, 3]
     blended: BlendedRays
 
@@ -80,27 +78,21 @@ def trace_view(traced: Traced, model: Model, view: View, request: Request) -> tu
     background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
     opacities = _opacities(g.opacity_logits, request.is_visible)
     prepared = traced.prepare(g, opacities)
-    tracer, in_rows = traced.tracer_for(prepared, conventions, backend), pixel_rays(camera, conventions)
-    order = block_order(camera.width, camera.height)
-    rays = Rays(*(field[order] for field in in_rows))
+    tracer, rays = traced.tracer_for(prepared, camera, conventions, backend), pixel_rays(camera, conventions)
     colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
     blended = tracer.blend(colors, rays, background, conventions)
     size = camera.height, camera.width
     channels = np.column_stack([blended.image, blended.depths]) if "depth" in wants else blended.image
-    image, alpha = np.empty_like(channels, dtype), np.empty(len(order), dtype)
-    image[order], alpha[order] = channels, 1 - blended.transmittances
-    stats = blend_stats(tracer.list_hits(in_rows, conventions), size, len(g.means)) if "stats" in wants else None
+    stats = blend_stats(tracer.list_hits(rays, conventions), size, len(g.means)) if "stats" in wants else None
     output = RenderOutput(
-        image.reshape(*size, -1),
-        alpha.reshape(size),
+        channels.astype(dtype).reshape(*size, -1),
+        (1 - blended.transmittances).astype(dtype).reshape(size),
         median_depth=None,
         stats=stats,
         visible_ids=np.flatnonzero(blended.is_seen),
         n_pairs=int(blended.n_hits.sum()),
     )
-    tape = _Tape(
-        model, camera, request, degree, background, traced, opacities, prepared, tracer, order, rays, colors, blended
-    )
+    tape = _Tape(model, camera, request, degree, background, traced, opacities, prepared, tracer, rays, colors, blended)
     return output, tape
 
 
@@ -114,16 +106,14 @@ def trace_view_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> Rend
     """
     g, camera, blended = tape.model.gaussians, tape.camera, tape.blended
     n_rays, dtype = len(tape.rays.near), g.means.dtype
-    v_pixels = v_image.reshape(n_rays, -1)[tape.order].astype(np.float64)
+    v_pixels = v_image.reshape(n_rays, -1).astype(np.float64)
     v_depths = v_pixels[:, 3] if v_pixels.shape[1] > 3 else np.zeros(n_rays)
-    v_T = np.zeros(n_rays) if v_alpha is None else -v_alpha.ravel()[tape.order].astype(np.float64)
+    v_T = np.zeros(n_rays) if v_alpha is None else -v_alpha.ravel().astype(np.float64)
     v = tape.tracer.blend_vjp(
         tape.colors, tape.rays, tape.background, tape.request.conventions, blended, (v_pixels[:, :3], v_depths, v_T)
     )
     v_quats, v_log_scales = tape.traced.shapes_vjp(g, tape.prepared, v.shapes)
-    v_directions = np.empty_like(v.directions)
-    v_directions[tape.order] = v.directions
-    v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v_directions)
+    v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v.directions)
     o = tape.opacities
     v_sh = tape.request.backend.sh_colors_vjp(
         g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, _seen_radii(blended.is_seen), v.colors.astype(dtype)

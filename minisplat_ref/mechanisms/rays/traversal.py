@@ -43,8 +43,6 @@ class RayTree(NamedTuple):
     """[N', C] of those that can be seen at all; the column ``OPACITY`` is the opacity."""
     gaussian_ids: Ints
     """[N'] int32 their rows in the population."""
-    parts: Ints
-    """[N'] int32 which part of the Gaussian; 0 of a whole one."""
     boxes: Floats
     """[K, 2, 6], as in :class:`~minisplat_ref.mechanisms.rays.bvh.Tree`; a bundle of a kernel holds no other bundle."""
     children: Ints
