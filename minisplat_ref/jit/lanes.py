@@ -58,7 +58,7 @@ def libm_log(a: Any) -> Any:
 
 
 def ldexp(a: Any, n: Any) -> Any:
-    """Return ``a 2^n`` of float32 lanes, for integers n that keep it a normal number: n is added to the exponent."""
+    """Return ``a 2^n`` of lanes, for integers n that keep it a normal number: n is added to the exponent."""
     return np.ldexp(a, np.asarray(n, np.int32))
 
 

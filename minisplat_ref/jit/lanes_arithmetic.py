@@ -173,8 +173,11 @@ _register_unary(libm_log, lambda builder, a: _call(builder, "llvm.log", a.type, 
 @register_lowering(ldexp)
 def _ldexp(typing: Any, a: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bits = ir.VectorType(I32, WIDTH)
-        exponent = builder.shl(builder.fptosi(args[1], bits), ir.Constant(bits, [23] * WIDTH))
+        is_wide = a.element == types.float64
+        bits = ir.VectorType(ir.IntType(64) if is_wide else I32, WIDTH)
+        n_32 = builder.fptosi(args[1], ir.VectorType(I32, WIDTH))  # not every processor has one to 64 bits
+        n_bits = builder.sext(n_32, bits) if is_wide else n_32
+        exponent = builder.shl(n_bits, ir.Constant(bits, [52 if is_wide else 23] * WIDTH))
         return builder.bitcast(builder.add(builder.bitcast(args[0], bits), exponent), args[0].type)
 
     return a(a, n), generate

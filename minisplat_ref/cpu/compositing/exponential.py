@@ -1,8 +1,8 @@
-"""The falloff exp(-sigma) in two precisions: libm's, and a polynomial that the compiler vectorises.
+"""The falloff exp(-sigma) in two precisions: libm's, and polynomials that the compiler vectorises.
 
 A call of libm's ``exp`` for every pixel is scalar and costs more than the rest of the blending. The polynomial form
 splits exp(x) = 2^n 2^f with n the nearest integer to x log2(e) and |f| <= 1/2, evaluates 2^f, and adds n to the
-exponent bits.
+exponent bits. That for float64 evaluates exp(f ln 2) = exp(x - n ln 2), with ln 2 as a sum of two numbers.
 """
 
 import math
@@ -23,6 +23,28 @@ _C0, _C1, _C2, _C3, _C4, _C5 = (
     .convert(kind=np.polynomial.Polynomial)
     .coef
 )
+
+
+_WIDE_LOG2_E = math.log2(math.e)
+_WIDE_SMALLEST = -1000.0  # of n: 2^n is a normal number
+_LN_2_HIGH = float.fromhex("0x1.62e42feep-1")  # its last bits are zero, so that its product with n is exact
+_LN_2_LOW = float.fromhex("0x1.a39ef35793c76p-33")
+
+# 1 / k! for k up to 13: on [-ln 2 / 2, ln 2 / 2] the rest of the series is below 5e-18
+_W0, _W1, _W2, _W3, _W4, _W5, _W6, _W7, _W8, _W9, _W10, _W11, _W12, _W13 = (1 / math.factorial(k) for k in range(14))
+
+
+@scalar
+def exp_wide(x):
+    """Return exp of float64 lanes x <= 0, to a relative error of 4e-16; at least 2^-1000."""
+    n = maximum(rint(x * _WIDE_LOG2_E), _WIDE_SMALLEST)
+    r = maximum((x - n * _LN_2_HIGH) - n * _LN_2_LOW, -1.0)  # below it only where n is its smallest
+    square = r * r
+    fourth = square * square
+    low = (_W0 + _W1 * r) + (_W2 + _W3 * r) * square
+    middle = (_W4 + _W5 * r) + (_W6 + _W7 * r) * square
+    high = (_W8 + _W9 * r) + (_W10 + _W11 * r) * square + (_W12 + _W13 * r) * fourth
+    return ldexp(low + (middle + high * fourth) * fourth, n)
 
 
 @scalar

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.compositing.exponential import exp_wide
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import (
@@ -26,7 +27,6 @@ from minisplat_ref.jit.lanes import (
     accumulate,
     broadcast,
     gather,
-    libm_exp,
     load,
     maximum,
     minimum,
@@ -185,11 +185,15 @@ def _kernels_of(response: RayResponse) -> _Kernels:
             packets, pairs = np.empty(longest, np.uint8), np.empty(longest, np.int64)
             ts, alphas = np.empty(WIDTH * longest, np.float64), np.empty(WIDTH * longest, np.float64)
             order, sorted_ts = np.empty(longest, np.int64), np.empty(longest, np.float64)
+            nearest_left = np.empty(longest, np.float64)
             for tile in dynamic_range(taken, len(listed.offsets) - 1):
                 first, end = listed.offsets[tile], listed.offsets[tile + 1]
                 tile_x, tile_y = TILE * (tile % n_columns), TILE * (tile // n_columns)
-                for i in range(first, end):
+                nearest_so_far = np.inf
+                for i in range(end - 1, first - 1, -1):
                     packets[i - first] = packets_of_box(boxes, rows[i], tile_x, tile_y)
+                    nearest_so_far = min(nearest_so_far, nearest[rows[i]])
+                    nearest_left[i - first] = nearest_so_far
                 for packet in range(N_PACKETS):
                     x, y = tile_x + PACKET_WIDTH * (packet & 1), tile_y + PACKET_HEIGHT * (packet >> 1)
                     if x >= width or y >= height:
@@ -202,13 +206,13 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         if not packets[i - first] >> packet & 1:
                             continue
                         row = rows[i]
-                        if nearest[row] > farthest:
+                        if nearest_left[i - first] > farthest:
                             break
                         t, q = meet(records, row, ray)
                         is_met = (q < np.inf) & (near < t) & (t < far) & (t <= bound)
                         if not reduce_any(is_met):
                             continue
-                        unclamped = records[row, OPACITY] * libm_exp(-0.5 * q)
+                        unclamped = records[row, OPACITY] * exp_wide(-0.5 * q)
                         alpha = minimum(unclamped, limits.alpha_max)
                         is_met = is_met & (alpha >= limits.alpha_min)
                         pairs[n] = i
@@ -224,10 +228,10 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                             continue
                         n_met = 0
                         for j in range(n):
-                            t_j = ts[WIDTH * j + k]
-                            if t_j == np.inf:
-                                continue
-                            i = n_met
+                            order[n_met], sorted_ts[n_met] = j, ts[WIDTH * j + k]
+                            n_met += ts[WIDTH * j + k] < np.inf
+                        for h in range(1, n_met):
+                            i, j, t_j = h, order[h], sorted_ts[h]
                             while i > 0 and (
                                 sorted_ts[i - 1] > t_j
                                 or (sorted_ts[i - 1] == t_j and rows[pairs[order[i - 1]]] > rows[pairs[j]])
@@ -235,7 +239,6 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                                 sorted_ts[i], order[i] = sorted_ts[i - 1], order[i - 1]
                                 i -= 1
                             sorted_ts[i], order[i] = t_j, j
-                            n_met += 1
                         start = fetch_and_add(n_used, n_met)
                         is_kept = start + n_met <= len(kept_hits)
                         T, red, green, blue, depth, count = 1.0, 0.0, 0.0, 0.0, 0.0, 0
@@ -272,8 +275,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
         taken = make_shared_counter()
         for _ in prange(n_threads):
             v_pairs, v_origins, v_directions = v
-            colors, is_hit, values = cotangents.colors, np.zeros(longest, np.bool_), np.zeros((4, WIDTH * longest))
-            unclampeds, v_unclampeds, v_ts, weights = values[0], values[1], values[2], values[3]
+            colors, is_hit, values = cotangents.colors, np.zeros(longest, np.bool_), np.zeros(4 * WIDTH * longest)
             for tile in dynamic_range(taken, len(listed.offsets) - 1):
                 first, end = listed.offsets[tile], listed.offsets[tile + 1]
                 tile_x, tile_y = TILE * (tile % n_columns), TILE * (tile // n_columns)
@@ -298,9 +300,10 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                             v_alpha = weight / alpha * v_dot_c - behind / (1.0 - alpha)
                             behind += weight * v_dot_c
                             is_hit[j] = True
-                            unclampeds[WIDTH * j + k], weights[WIDTH * j + k] = unclamped, weight
-                            v_unclampeds[WIDTH * j + k] = v_alpha if unclamped <= limits.alpha_max else 0.0
-                            v_ts[WIDTH * j + k] = weight * v_depth
+                            at = 4 * WIDTH * j + k
+                            values[at], values[at + WIDTH] = unclamped, weight
+                            values[at + 2 * WIDTH] = v_alpha if unclamped <= limits.alpha_max else 0.0
+                            values[at + 3 * WIDTH] = weight * v_depth
                     eight, zero = pixels_of_packet(x, y, listed, y * width + x), broadcast(0.0)
                     ray = rays_of(rays, eight)
                     v_image = (
@@ -313,11 +316,10 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         if not is_hit[j]:
                             continue
                         row = rows[first + j]
-                        weight, v_unclamped = load(weights, WIDTH * j), load(v_unclampeds, WIDTH * j)
-                        unclamped = load(unclampeds, WIDTH * j)
-                        of_mean, of_direction, of_shape = meet_vjp(
-                            records, row, ray, unclamped, v_unclamped, load(v_ts, WIDTH * j)
-                        )
+                        at = 4 * WIDTH * j
+                        unclamped, weight = load(values, at), load(values, at + WIDTH)
+                        v_unclamped, v_t = load(values, at + 2 * WIDTH), load(values, at + 3 * WIDTH)
+                        of_mean, of_direction, of_shape = meet_vjp(records, row, ray, unclamped, v_unclamped, v_t)
                         is_own = weight > 0.0
                         of_mean, of_direction = only_where(is_own, of_mean), only_where(is_own, of_direction)
                         o_x, o_y, o_z = o_x - of_mean[0], o_y - of_mean[1], o_z - of_mean[2]
@@ -329,10 +331,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         accumulate(v_pairs, at, reduce_sums(sums[:8]))
                         accumulate(v_pairs, at + WIDTH, reduce_sums(sums[8:]))
                         is_hit[j] = False
-                        store(unclampeds, WIDTH * j, zero)
-                        store(v_unclampeds, WIDTH * j, zero)
-                        store(v_ts, WIDTH * j, zero)
-                        store(weights, WIDTH * j, zero)
+                        store(values, 4 * WIDTH * j, (zero, zero, zero, zero))
                     eight = pixels_of_packet(x, y, listed, width * height)
                     scatter(v_origins, eight, 0, o_x)
                     scatter(v_origins, eight, 1, o_y)

@@ -101,11 +101,11 @@ def list_tiles(ellipsoids: Ellipsoids, camera: Camera, conventions: Conventions)
         seen.width,
         seen.height,
     )
-    boxes, nearest = np.empty((n, 4), np.int32), np.empty(n)
+    boxes, depths, nearest = np.empty((n, 4), np.int32), np.empty(n), np.empty(n)
     offsets = np.zeros(-(-seen.width // TILE) * -(-seen.height // TILE) + 1, np.int64)
     row_offsets = np.zeros(n + 1, np.int64)
-    _bound_all(ellipsoids, frame, boxes, nearest, offsets, row_offsets)
-    order = np.argsort(nearest, kind="stable")
+    _bound_all(ellipsoids, frame, boxes, (depths, nearest), offsets, row_offsets)
+    order = np.argsort(depths, kind="stable")
     rows, pairs = np.empty((2, int(offsets[-1])), np.int32)
     _fill(order, boxes, -(-seen.width // TILE), offsets, row_offsets, rows, pairs)
     return TileLists(offsets, rows, boxes, nearest, row_offsets, pairs, seen.width, seen.height)
@@ -139,13 +139,13 @@ def pixel_range(low, high, focal, center, n):
 
 
 @kernel(parallel=False)
-def _bound_all(ellipsoids, frame, boxes, nearest, offsets, row_offsets):
-    """Write boxes and lower bounds of t, the first pair of each tile, and the number of pairs of each primitive."""
-    means, axes, reaches = ellipsoids
+def _bound_all(ellipsoids, frame, boxes, along, offsets, row_offsets):
+    """Write boxes, depths and lower bounds of t, the first pair of each tile, and the number of pairs of each primitive."""
+    (means, axes, reaches), (depths, nearest) = ellipsoids, along
     R, t, n_columns = frame.R, frame.t, (frame.width + TILE - 1) // TILE
     for n in range(len(means)):
         boxes[n, 0] = boxes[n, 1] = boxes[n, 2] = boxes[n, 3] = 0
-        nearest[n] = np.inf
+        depths[n] = np.inf
         q, mx, my, mz = reaches[n], means[n, 0], means[n, 1], means[n, 2]
         x = R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0]
         y = R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1]
@@ -170,7 +170,7 @@ def _bound_all(ellipsoids, frame, boxes, nearest, offsets, row_offsets):
         if x0 >= x1 or y0 >= y1:
             continue
         boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3] = x0, y0, x1, y1
-        nearest[n] = z - depth
+        depths[n], nearest[n] = z, z - depth
         for row in range(y0 // TILE, (y1 - 1) // TILE + 1):
             for column in range(x0 // TILE, (x1 - 1) // TILE + 1):
                 offsets[row * n_columns + column + 1] += 1
