@@ -108,7 +108,8 @@ def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
     So t is the camera z of a point on the ray, and the near and far planes of ``conventions`` bound it.
     """
     camera = with_principal_point(camera, conventions).astype(np.float64)
-    directions = _camera_rays(camera) @ camera.cam_from_world_R
+    across, down = (slopes @ camera.cam_from_world_R for slopes in _slopes(camera))
+    directions = (across + camera.cam_from_world_R[2] + down[:, None]).reshape(-1, 3)
     origins = np.broadcast_to(camera.center, directions.shape)
     limits = (np.full(len(directions), plane) for plane in (conventions.near_plane, conventions.far_plane))
     return Rays(np.ascontiguousarray(origins), directions, *limits)
@@ -122,6 +123,8 @@ def pixel_rays_vjp(
     With ``d = R^T r`` and ``O = -R^T t``::
 
         v_R = sum_p r_p v_d_p^T - t v_O^T,   v_t = -R v_O,   v_O = sum_p v_O_p
+
+    The slopes of r depend on the column or on the row, so derivatives are summed over rows or columns first.
 
     Parameters
     ----------
@@ -138,7 +141,11 @@ def pixel_rays_vjp(
     camera = with_principal_point(camera, conventions).astype(np.float64)
     R, t = camera.cam_from_world_R, camera.cam_from_world_t
     v_O = v_origins.sum(axis=0)
-    v_R = np.einsum("pi,pj->ij", _camera_rays(camera), v_directions) - np.outer(t, v_O)
+    across, down = _slopes(camera)
+    by_pixel = v_directions.reshape(camera.height, camera.width, 3)
+    by_column, by_row = by_pixel.sum(axis=0), by_pixel.sum(axis=1)
+    v_R = across.T @ by_column + down.T @ by_row - np.outer(t, v_O)
+    v_R[2] += by_row.sum(axis=0)
     return v_R, -R @ v_O
 
 
@@ -169,7 +176,8 @@ def blend_stats(hits: Hits, size: tuple[int, int], n: int) -> BlendStats:
     )
 
 
-def _camera_rays(camera: Camera) -> Floats:
-    """Return the directions [H W, 3] in the camera frame."""
-    ys, xs = np.mgrid[: camera.height, : camera.width] + 0.5
-    return pinhole_rays(xs, ys, camera).reshape(-1, 3)
+def _slopes(camera: Camera) -> tuple[Floats, Floats]:
+    """Return (x, 0, 0) [W, 3] and (0, y, 0) [H, 3]: a ray's direction in the camera frame is their sum and (0, 0, 1)."""
+    across = pinhole_rays(np.arange(camera.width) + 0.5, camera.cy, camera)
+    down = pinhole_rays(camera.cx, np.arange(camera.height) + 0.5, camera)
+    return across * [1, 0, 0], down * [0, 1, 0]

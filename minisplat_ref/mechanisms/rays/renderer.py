@@ -119,8 +119,9 @@ def trace_view_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> Rend
         g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, _seen_radii(blended.is_seen), v.colors.astype(dtype)
     )
     R, t = camera.cam_from_world_R, camera.cam_from_world_t
-    depths = np.where(blended.is_seen, g.means @ R[2] + t[2], 0.0)  # [N]
-    v_in_image = (v.means @ R.T)[:, :2] * depths[:, None] / [camera.fx, camera.fy]
+    # Sums, not products of matrices: the threads of those keep a core busy for a while after it.
+    depths = np.where(blended.is_seen, np.einsum("ni,i->n", g.means, R[2]) + t[2], 0.0)  # [N]
+    v_in_image = np.einsum("ni,ki->nk", v.means, R[:2]) * depths[:, None] / [camera.fx, camera.fy]
     of_fields = {
         "means": v.means + v_sh.means,
         "quats": v_quats,

@@ -95,11 +95,19 @@ class KeptHits(NamedTuple):
     """[1] the room that all hits need; if there was less, some are missing."""
 
 
+class _Blended(NamedTuple):
+    colors: Floats  # [N, 3]
+    background: Floats  # [3]
+    transmittances: Floats  # [P]
+    starts: Ints  # [P] as of the hits that were kept
+    n_hits: Ints  # [P]
+    hits: Floats  # [H, 4]
+
+
 class _Cotangents(NamedTuple):
-    colors: Floats  # [N, 3] of the primitives, for products with v_image
     image: Floats  # [P, 3]
     depths: Floats  # [P]
-    behind: Floats  # [P] T_end (v_image . b + v_T)
+    transmittances: Floats  # [P]
 
 
 class _Kernels(NamedTuple):
@@ -268,14 +276,15 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         depths[r], transmittances[r], n_hits[r], starts[r] = depth, T, count, start
 
     @kernel()
-    def differentiate(listed, records, rays, limits, n_threads, kept, cotangents, v):
+    def differentiate(listed, records, rays, limits, n_threads, blended, cotangents, v):
         """Write the gradient with respect to each ray, and that of each pair: mean, opacity, colour, shape."""
         rows, width, height = listed.rows, listed.width, listed.height
         n_columns, longest = (width + TILE - 1) // TILE, np.max(np.diff(listed.offsets))
         taken = make_shared_counter()
         for _ in prange(n_threads):
             v_pairs, v_origins, v_directions = v
-            colors, is_hit, values = cotangents.colors, np.zeros(longest, np.bool_), np.zeros(4 * WIDTH * longest)
+            is_hit, values = np.zeros(longest, np.bool_), np.zeros(4 * WIDTH * longest)
+            colors, background, transmittances, starts, n_hits, hits = blended
             for tile in dynamic_range(taken, len(listed.offsets) - 1):
                 first, end = listed.offsets[tile], listed.offsets[tile + 1]
                 tile_x, tile_y = TILE * (tile % n_columns), TILE * (tile // n_columns)
@@ -290,13 +299,15 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                             continue
                         r = (y + k // PACKET_WIDTH) * width + x + k % PACKET_WIDTH
                         red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
-                        behind, v_depth = cotangents.behind[r], cotangents.depths[r]
-                        for h in range(kept.starts[r] + kept.n_hits[r] - 1, kept.starts[r] - 1, -1):
-                            pair = int(kept.hits[h, PAIR])
-                            g, j, weight, unclamped = rows[pair], pair - first, kept.hits[h, 3], kept.hits[h, UNCLAMPED]
+                        v_depth = cotangents.depths[r]
+                        behind = red * background[0] + green * background[1] + blue * background[2]
+                        behind = transmittances[r] * (behind + cotangents.transmittances[r])
+                        for h in range(starts[r] + n_hits[r] - 1, starts[r] - 1, -1):
+                            pair, unclamped, weight = int(hits[h, PAIR]), hits[h, UNCLAMPED], hits[h, WEIGHT]
+                            g, j = rows[pair], pair - first
                             alpha = min(limits.alpha_max, unclamped)
                             v_dot_c = red * colors[g, 0] + green * colors[g, 1] + blue * colors[g, 2]
-                            v_dot_c += v_depth * kept.hits[h, T_OF_HIT]
+                            v_dot_c += v_depth * hits[h, T_OF_HIT]
                             v_alpha = weight / alpha * v_dot_c - behind / (1.0 - alpha)
                             behind += weight * v_dot_c
                             is_hit[j] = True
@@ -403,18 +414,18 @@ def blend_rays_vjp(
     response, lists, records = primitives
     kernels, kept = _kernels_of(response), _kept_of(primitives, rays, conventions, blended)
     n_rays, n = len(rays.near), len(records)
-    behind = blended.transmittances * (v_image @ _wide(background) + v_transmittances)
-    cotangents, limits = _Cotangents(_wide(colors), v_image, v_depths, behind), limits_of(conventions, n)
+    cotangents, limits = _Cotangents(v_image, v_depths, v_transmittances), limits_of(conventions, n)
+    known = _Blended(_wide(colors), _wide(background), blended.transmittances, kept.starts, kept.n_hits, kept.hits)
     v_pairs, sums = large_empty((N_SUMS * len(lists.rows),), np.dtype(np.float64)), np.empty((n, N_SUMS))
     v = v_pairs, np.empty((n_rays + 1, 3)), np.empty((n_rays + 1, 3))  # the last row is for no pixel
-    kernels.differentiate(lists, records, rays, limits, n_threads(), kept, cotangents, v)
+    kernels.differentiate(lists, records, rays, limits, n_threads(), known, cotangents, v)
     _add_up(lists, n_threads(), v_pairs, sums)
     return RayGradient(
         means=sums[:, :OF_OPACITY],
         shapes=response.shapes_of(sums[:, OF_SHAPE : OF_SHAPE + response.n_shape]),
         opacities=sums[:, OF_OPACITY],
         colors=sums[:, OF_COLOR:OF_SHAPE],
-        background=np.sum(blended.transmittances[:, None] * v_image, axis=0),
+        background=np.einsum("p,pk->k", blended.transmittances, v_image),
         origins=v[1][:-1],
         directions=v[2][:-1],
     )
@@ -427,7 +438,9 @@ def _blend(
     n_rays, n = len(rays.near), len(primitives.records)
     image, depths, transmittances, is_seen = np.empty((n_rays, 3)), np.empty(n_rays), np.empty(n_rays), np.zeros(n, bool)
     starts, n_hits, n_used = np.empty(n_rays, np.int64), np.empty(n_rays, np.int64), np.zeros(1, np.int64)
-    kept = KeptHits(starts, n_hits, large_empty((room, 4), np.dtype(np.float64)), n_used)
+    room_with_rest = 1 << (room - 1).bit_length() if room > 0 else 0  # so that its memory fits the next image, too
+    hits = large_empty((room_with_rest, 4), np.dtype(np.float64))[:room]
+    kept = KeptHits(starts, n_hits, hits, n_used)
     limits, wide = limits_of(conventions, n), (_wide(shades[0]), _wide(shades[1]))
     arrays = image, depths, transmittances, is_seen
     response, lists, records = primitives
