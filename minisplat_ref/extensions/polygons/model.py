@@ -260,10 +260,18 @@ def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
     return turned._replace(log_scales=log_scales)
 
 
+def _prepare(population: Any, opacities: Floats, backend: Backend) -> Polygons:
+    return make_polygons(population, opacities)
+
+
+def _shapes_vjp(population: Any, polygons: Polygons, v_spans: Floats, backend: Backend) -> tuple[Floats, Floats]:
+    return spans_vjp(population, polygons, v_spans)
+
+
 TRACED = Representation(
     "flat Gaussians in polygons",
     extend=press_flat,
-    renderer=make_ray_renderer(Traced("polygons", make_polygons, make_image_tracer, spans_vjp)),
+    renderer=make_ray_renderer(Traced("polygons", _prepare, make_image_tracer, _shapes_vjp)),
 )
 
 POLYGONS = GS_ACCEL._replace(name="polygons")

@@ -1,4 +1,4 @@
-"""One ray and one 3D Gaussian as kernels read them: the formulas of :mod:`.model`.
+"""One ray and one 3D Gaussian as kernels read them, and the maps of all Gaussians: the formulas of :mod:`.model`.
 
 The loops are those of ``mechanisms.rays.tile_kernels`` for the rays of an image, and of ``mechanisms.rays.traversal``
 and ``mechanisms.rays.kernels`` for any others.
@@ -6,9 +6,11 @@ and ``mechanisms.rays.kernels`` for any others.
 
 import numpy as np
 
-from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import select
+from minisplat_ref.cpu.gaussian_rows import contiguous, eight_rows, matrix, quaternion, triple
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import WIDTH, libm_exp, scatter, select
 from minisplat_ref.mechanisms.rays.tile_kernels import RayResponse
+from minisplat_ref.scalar.covariance import normalize, normalize_vjp, rotation, rotation_vjp
 from minisplat_ref.types import Floats
 
 REACH, MEAN, MAP = 1, 2, 5  # columns of a record beside the opacity
@@ -89,3 +91,74 @@ def _as_maps(v: Floats) -> Floats:
 
 RESPONSE = RayResponse(meet, meet_vjp, 9, _as_maps)
 """A 3D Gaussian where its density on the ray is greatest."""
+
+
+# --- maps of all Gaussians ---
+
+
+def whitening_maps(quats: Floats, log_scales: Floats) -> Floats:
+    """Return the maps [N, 3, 3] of quaternions [N, 4] and logarithms of scales [N, 3]: see :func:`.model.whiten`."""
+    maps = np.empty((len(quats), 3, 3))
+    _map_all(*contiguous(quats, log_scales), maps)
+    return maps
+
+
+def whitening_maps_vjp(quats: Floats, log_scales: Floats, maps: Floats, v_maps: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`whitening_maps`: see :func:`.model.whiten_vjp`."""
+    v_quats, v_log_scales = np.empty((len(quats), 4)), np.empty((len(quats), 3))
+    _map_all_vjp(*contiguous(quats, log_scales, maps, v_maps), (v_quats, v_log_scales))
+    return v_quats, v_log_scales
+
+
+@scalar
+def size(v):
+    """Return the sum of the magnitudes of three numbers."""
+    return abs(v[0]) + abs(v[1]) + abs(v[2])
+
+
+@scalar
+def map_row_vjp(is_met, M_i, v_M_i, log_s):
+    """Return ``v_log_s_i = -M_i . v_M_i`` and column i of v_R, ``v_M_i / s_i``; zeros for Gaussians that no ray meets."""
+    inverse = libm_exp(-log_s)
+    along = M_i[0] * v_M_i[0] + M_i[1] * v_M_i[1] + M_i[2] * v_M_i[2]
+    of_R = (
+        select(is_met, inverse * v_M_i[0], 0.0),
+        select(is_met, inverse * v_M_i[1], 0.0),
+        select(is_met, inverse * v_M_i[2], 0.0),
+    )
+    return select(is_met, -along, 0.0), of_R
+
+
+@kernel()
+def _map_all(quats, log_scales, maps):
+    n = len(quats)
+    for part in prange((n + WIDTH - 1) // WIDTH):
+        rows = eight_rows(part * WIDTH, n)
+        w, x, y, z, _ = normalize(*quaternion(quats, rows))
+        R, s = rotation(w, x, y, z), triple(log_scales, rows)
+        for i in range(3):
+            inverse = libm_exp(-s[i])
+            for j in range(3):
+                scatter(maps, rows, 3 * i + j, inverse * R[j][i])
+
+
+@kernel()
+def _map_all_vjp(quats, log_scales, maps, v_maps, v):
+    n = len(quats)
+    for part in prange((n + WIDTH - 1) // WIDTH):
+        v_quats, v_log_scales = v
+        rows = eight_rows(part * WIDTH, n)
+        w, x, y, z, inverse_length = normalize(*quaternion(quats, rows))
+        M, v_M, s = matrix(maps, rows), matrix(v_maps, rows), triple(log_scales, rows)
+        is_met = size(v_M[0]) + size(v_M[1]) + size(v_M[2]) > 0.0
+        v_s_0, of_0 = map_row_vjp(is_met, M[0], v_M[0], s[0])
+        v_s_1, of_1 = map_row_vjp(is_met, M[1], v_M[1], s[1])
+        v_s_2, of_2 = map_row_vjp(is_met, M[2], v_M[2], s[2])
+        v_R = (of_0[0], of_1[0], of_2[0]), (of_0[1], of_1[1], of_2[1]), (of_0[2], of_1[2], of_2[2])
+        v_unit = rotation_vjp(w, x, y, z, v_R)
+        v_q = normalize_vjp((w, x, y, z), inverse_length, v_unit)
+        for k in range(4):
+            scatter(v_quats, rows, k, v_q[k])
+        scatter(v_log_scales, rows, 0, v_s_0)
+        scatter(v_log_scales, rows, 1, v_s_1)
+        scatter(v_log_scales, rows, 2, v_s_2)

@@ -8,7 +8,7 @@ This is section 3 of RaySplats. The map ``M = diag(1/s) R^T`` takes the Gaussian
     e = p - t v,  q = e . e          the squared distance from the centre there, in standard deviations
     alpha = min(alpha_max, o exp(-q / 2))
 
-The maps are of the size of the population, and both backends use them. Here every ray is evaluated with every Gaussian,
+Here every ray is evaluated with every Gaussian,
 and ``mechanisms.rays.blending`` blends the hits; the kernels (:mod:`.kernels`) look them up in
 the lists of an image's tiles, or in a tree.
 """
@@ -19,7 +19,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.rays.kernels import MAP, MEAN, N_COLUMNS, REACH, RESPONSE
+from minisplat_ref.extensions.rays.kernels import (
+    MAP,
+    MEAN,
+    N_COLUMNS,
+    REACH,
+    RESPONSE,
+    whitening_maps,
+    whitening_maps_vjp,
+)
 from minisplat_ref.mechanisms.rays import blending, kernels, tile_kernels
 from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.bvh import SLACK, build
@@ -220,7 +228,8 @@ def whiten_model(model: Model) -> Whitened:
     """Return the Gaussians of a model as rays meet them."""
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-model.gaussians.opacity_logits.astype(np.float64)))
-    return _prepare(model.gaussians, opacities)
+    g = model.gaussians
+    return whiten(g.means, g.quats, g.log_scales, opacities)
 
 
 def make_tracer(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
@@ -241,11 +250,18 @@ def make_image_tracer(
     return blending.image_tracer_of(prepare_meeting(gaussians))
 
 
-def _prepare(population: Any, opacities: Floats) -> Whitened:
+def _prepare(population: Any, opacities: Floats, backend: Backend) -> Whitened:
+    if backend.is_compiled:
+        maps = whitening_maps(population.quats, population.log_scales)
+        return Whitened(population.means.astype(np.float64), maps, opacities.astype(np.float64))
     return whiten(population.means, population.quats, population.log_scales, opacities)
 
 
-def _shapes_vjp(population: Any, gaussians: Whitened, v_maps: Floats) -> tuple[Floats, Floats]:
+def _shapes_vjp(
+    population: Any, gaussians: Whitened, v_maps: Floats, backend: Backend
+) -> tuple[Floats, Floats]:
+    if backend.is_compiled:
+        return whitening_maps_vjp(population.quats, population.log_scales, gaussians.maps, v_maps)
     return whiten_vjp(population.quats, population.log_scales, gaussians, v_maps)
 
 

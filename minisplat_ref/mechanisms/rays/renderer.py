@@ -31,13 +31,13 @@ class Traced(NamedTuple):
 
     name: str
     """Of the extension."""
-    prepare: Callable[[Any, Floats], Any]
-    """``prepare(population, opacities)``: the Gaussians as rays meet them, of opacities [N] in float64, 0 where one is
-    not rendered."""
+    prepare: Callable[[Any, Floats, Backend], Any]
+    """``prepare(population, opacities, backend)``: the Gaussians as rays meet them, of opacities [N] in float64, 0
+    where one is not rendered."""
     tracer_for: Callable[[Any, Camera, Conventions, Backend], ImageTracer]
     """``tracer_for(prepared, camera, conventions, backend)``: the tracer of a backend; lists are made here."""
-    shapes_vjp: Callable[[Any, Any, Floats], tuple[Floats, Floats]]
-    """``shapes_vjp(population, prepared, v_shapes)``: the gradient with respect to quaternions [N, 4] and logarithms of
+    shapes_vjp: Callable[[Any, Any, Floats, Backend], tuple[Floats, Floats]]
+    """``shapes_vjp(population, prepared, v_shapes, backend)``: the gradient with respect to quaternions [N, 4] and logarithms of
     scales [N, 3]."""
 
 
@@ -77,7 +77,7 @@ def trace_view(traced: Traced, model: Model, view: View, request: Request) -> tu
     degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
     opacities = _opacities(g.opacity_logits, request.is_visible)
-    prepared = traced.prepare(g, opacities)
+    prepared = traced.prepare(g, opacities, backend)
     tracer, rays = traced.tracer_for(prepared, camera, conventions, backend), pixel_rays(camera, conventions)
     colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
     blended = tracer.blend(colors, rays, background, conventions)
@@ -112,7 +112,7 @@ def trace_view_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> Rend
     v = tape.tracer.blend_vjp(
         tape.colors, tape.rays, tape.background, tape.request.conventions, blended, (v_pixels[:, :3], v_depths, v_T)
     )
-    v_quats, v_log_scales = tape.traced.shapes_vjp(g, tape.prepared, v.shapes)
+    v_quats, v_log_scales = tape.traced.shapes_vjp(g, tape.prepared, v.shapes, tape.request.backend)
     v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v.directions)
     o = tape.opacities
     v_sh = tape.request.backend.sh_colors_vjp(
