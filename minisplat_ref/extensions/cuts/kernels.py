@@ -1,7 +1,7 @@
 """Gaussians with cuts on lanes: a response for the plain kernels.
 
 A record holds the polygons' vertices and the inverse squared length of each piece, so that a pixel takes one loop over
-the edges, which counts crossings by the sign of a product and keeps the nearest point with its curve and weights.
+the edges, which counts crossings by the sign of a product and keeps the nearest point with its piece.
 """
 
 import functools
@@ -10,19 +10,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.compositing.exponential import choose_exponential
+from minisplat_ref.cpu.compositing.exponential import exp_fast, exp_wide
 from minisplat_ref.cpu.compositing.responses import CONIC_GRADIENTS, MEAN_X, OPACITY, KernelResponse, conic_response
-from minisplat_ref.extensions.cuts.response import LENGTH_MIN, N_EDGES, N_POINTS, VERTICES, CutFootprints
-from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select, sqrt
-from minisplat_ref.jit.literals import HALF, ONE, ZERO
+from minisplat_ref.cpu.gaussian_rows import DOUBLE
+from minisplat_ref.extensions.cuts.response import LENGTH_MIN, N_EDGES, N_POINTS, CutFootprints
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import broadcast, maximum, minimum, reduce_any, select, sqrt
+from minisplat_ref.jit.literals import HALF, ONE, THREE, ZERO
 from minisplat_ref.mechanisms.payload.footprints import boxes_of
 from minisplat_ref.types import Floats
 
 POINTS = CONIC_GRADIENTS  # gradients of the control points; the kernels do not read these columns
 N_VERTICES = 2 * (N_EDGES + 1)  # columns of a curve
 N_INVERSES = N_EDGES + 2
-_WEIGHTS = VERTICES.astype(np.float32)  # exact
+_N_EDGES, _EDGE = np.float32(N_EDGES), np.float32(1 / N_EDGES)  # exact
 _FAR = np.float32(1e30)  # px^2
 
 
@@ -35,6 +36,8 @@ class Columns(NamedTuple):
     width: int
     """px."""
     inverse_width: int
+    alpha_min: int
+    """Below which nothing is seen."""
     vertices: int
     """Of the curves one after the other, x and y."""
     inverses: int
@@ -50,9 +53,11 @@ class Columns(NamedTuple):
 def columns_of(n_curves: int) -> Columns:
     """Return the columns for a number of curves."""
     shift = POINTS + 2 * N_POINTS * n_curves
-    vertices = shift + 5
+    vertices = shift + 6
     inverses = vertices + N_VERTICES * n_curves
-    return Columns(shift, shift + 2, shift + 3, shift + 4, vertices, inverses, inverses + N_INVERSES * n_curves)
+    return Columns(
+        shift, shift + 2, shift + 3, shift + 4, shift + 5, vertices, inverses, inverses + N_INVERSES * n_curves
+    )
 
 
 @functools.cache
@@ -61,25 +66,29 @@ def make_cut_response(exp: Callable, n_curves: int) -> KernelResponse:
     conic, columns = conic_response(exp), columns_of(n_curves)
     flat_hit, flat_hit_vjp = conic.hit, conic.hit_vjp
     depth_at, width_at, inverse_width_at = columns.depth, columns.width, columns.inverse_width
+    alpha_min_at = columns.alpha_min
     vertices_at, inverses_at = columns.vertices, columns.inverses
-    spread = _spread(n_curves)
+    of_points = _points_gradient(n_curves)
 
     @scalar
-    def nearer(nearest, away, weights, curve):
-        """Return the nearer of two points: d - q with its square, and the curve with its control points' weights."""
-        x, y, square, w_0, w_1, w_2, w_3, of = nearest
+    def nearer(nearest, away, f, piece):
+        """Return the nearer of two points: d - q with its square, f, and the piece that it is on."""
+        x, y, square, f_of, of = nearest
         new = away[0] * away[0] + away[1] * away[1]
         is_nearer = new < square
         return (
             select(is_nearer, away[0], x),
             select(is_nearer, away[1], y),
             select(is_nearer, new, square),
-            select(is_nearer, weights[0], w_0),
-            select(is_nearer, weights[1], w_1),
-            select(is_nearer, weights[2], w_2),
-            select(is_nearer, weights[3], w_3),
-            select(is_nearer, curve, of),
+            select(is_nearer, f, f_of),
+            select(is_nearer, piece, of),
         )
+
+    @scalar
+    def sign(a):
+        """Return +1 for lanes above 0, and -1 for others."""
+        nothing = a * ZERO
+        return select(a > ZERO, nothing + ONE, nothing - ONE)
 
     @scalar
     def along(records, n, dx, dy, k, end):
@@ -92,45 +101,35 @@ def make_cut_response(exp: Callable, n_curves: int) -> KernelResponse:
     def walk_curve(records, n, dx, dy, k, side, nearest):
         """Return the side after the crossings of curve k, and the nearest point if it is on that curve."""
         nothing = broadcast(records.dtype.type(0))
-        curve, first_vertex = nothing + records.dtype.type(k), vertices_at + N_VERTICES * k
+        first_vertex, first_piece = vertices_at + N_VERTICES * k, N_INVERSES * k
+        o_x, o_y = records[n, first_vertex], records[n, first_vertex + 1]
+        first = sign(dx * o_y - dy * o_x)
         for i in range(N_EDGES):
-            o_x, o_y, e_x, e_y = (
-                records[n, first_vertex + 2 * i],
-                records[n, first_vertex + 2 * i + 1],
-                records[n, first_vertex + 2 * i + 2],
-                records[n, first_vertex + 2 * i + 3],
-            )
+            e_x, e_y = records[n, first_vertex + 2 * i + 2], records[n, first_vertex + 2 * i + 3]
             u_x, u_y, r_x, r_y = e_x - o_x, e_y - o_y, dx - o_x, dy - o_y
-            f = (r_x * u_x + r_y * u_y) * records[n, inverses_at + N_INVERSES * k + i]
+            f = (r_x * u_x + r_y * u_y) * records[n, inverses_at + first_piece + i]
             f = minimum(maximum(f, ZERO), ONE)
-            g = ONE - f
-            weights = (
-                g * _WEIGHTS[i, 0] + f * _WEIGHTS[i + 1, 0],
-                g * _WEIGHTS[i, 1] + f * _WEIGHTS[i + 1, 1],
-                g * _WEIGHTS[i, 2] + f * _WEIGHTS[i + 1, 2],
-                g * _WEIGHTS[i, 3] + f * _WEIGHTS[i + 1, 3],
-            )
-            nearest = nearer(nearest, (r_x - f * u_x, r_y - f * u_y), weights, curve)
-            first = select(dx * o_y - dy * o_x > ZERO, nothing + ONE, nothing - ONE)
-            last = select(dx * e_y - dy * e_x > ZERO, nothing + ONE, nothing - ONE)
-            beyond = select(u_x * r_y - u_y * r_x > ZERO, nothing + ONE, nothing - ONE)
-            origin = select(u_y * o_x - u_x * o_y > ZERO, ONE, -ONE)
-            side = select((first * last < ZERO) & (beyond * origin < ZERO), -side, side)
+            piece = nothing + records.dtype.type(first_piece + i)
+            nearest = nearer(nearest, (r_x - f * u_x, r_y - f * u_y), f, piece)
+            last, origin = sign(dx * e_y - dy * e_x), select(u_y * o_x - u_x * o_y > ZERO, ONE, -ONE)
+            crossed = first * last + origin * sign(u_x * r_y - u_y * r_x)
+            side = select(crossed < -ONE, -side, side)  # both products are -1
+            o_x, o_y, first = e_x, e_y, last
         # The two rays, along which the ends B move away from the centre.
-        f = maximum(along(records, n, dx, dy, k, 0), ZERO)
+        f, piece = maximum(along(records, n, dx, dy, k, 0), ZERO), nothing + records.dtype.type(first_piece + N_EDGES)
         away = dx - (ONE + f) * records[n, first_vertex], dy - (ONE + f) * records[n, first_vertex + 1]
-        nearest = nearer(nearest, away, (ONE + f, nothing, nothing, nothing), curve)
+        nearest = nearer(nearest, away, f, piece)
         f, end = maximum(along(records, n, dx, dy, k, 1), ZERO), first_vertex + 2 * N_EDGES
         away = dx - (ONE + f) * records[n, end], dy - (ONE + f) * records[n, end + 1]
-        return side, nearer(nearest, away, (nothing, nothing, nothing, ONE + f), curve)
+        return side, nearer(nearest, away, f, piece + ONE)
 
     @scalar
-    def side_and_nearest(records, n, dx, dy):
+    def side_and_nearest(records, n, dx, dy, n_walked):
         """Return +1 where an even number of edges is crossed, else -1, and the nearest point to the pixel at d."""
         nothing = broadcast(records.dtype.type(0))
-        nearest = (nothing, nothing, nothing + _FAR, nothing, nothing, nothing, nothing, nothing)
+        nearest = (nothing, nothing, nothing + _FAR, nothing, nothing)
         side = nothing + ONE
-        for k in range(n_curves):
+        for k in range(n_walked):
             side, nearest = walk_curve(records, n, dx, dy, k, side, nearest)
         return side, nearest
 
@@ -145,23 +144,24 @@ def make_cut_response(exp: Callable, n_curves: int) -> KernelResponse:
 
     @scalar
     def hit(records, n, x, y):
+        """Return the hit; where no pixel reaches the smallest alpha without the cuts, none is evaluated."""
         flat, _, (e, dy, falloff) = flat_hit(records, n, x, y)
         dx = x - records[n, MEAN_X]
-        side, nearest = side_and_nearest(records, n, dx, -dy)
+        n_walked = n_curves if reduce_any(flat >= records[n, alpha_min_at]) else 0
+        side, nearest = side_and_nearest(records, n, dx, -dy, n_walked)
         mask = masked(records, n, side, sqrt(nearest[2]))
         return flat * mask, records[n, depth_at], (mask, side, nearest, (e, dy, falloff))
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
         """Add ``v_z = mask (1 - mask) v_mask / w`` along the unit vector from the nearest point, by its weights."""
-        mask, side, (x, y, square, w_0, w_1, w_2, w_3, curve), flat = place
+        mask, side, (x, y, square, f, piece), flat = place
         v_flat = flat_hit_vjp(records, n, flat, mask * v_mean, mask * v_shape, v_place)
         v_mask = v_shape * records[n, OPACITY] * flat[2]
         inverse = select(square > ZERO, ONE / sqrt(select(square > ZERO, square, ONE)), ZERO)
         v_z = side * mask * (ONE - mask) * v_mask * records[n, inverse_width_at] * inverse
         v_x, v_y = -v_z * x, -v_z * y
-        v_points = (w_0 * v_x, w_0 * v_y, w_1 * v_x, w_1 * v_y, w_2 * v_x, w_2 * v_y, w_3 * v_x, w_3 * v_y)
-        return v_flat + spread(curve, v_points) + (v_x, v_y)
+        return v_flat + of_points(piece, f, (v_x, v_y)) + (v_x, v_y)
 
     return KernelResponse(
         functools.partial(_records, conic.records),
@@ -173,54 +173,92 @@ def make_cut_response(exp: Callable, n_curves: int) -> KernelResponse:
     )
 
 
-def _spread(n_curves: int, first: int = 0) -> Callable:
-    """Return a function that puts eight lanes of gradients in the columns of their curve, and zeros in the others."""
-    number = np.float32(first)
+@scalar
+def inverse_square(x, y):
+    """Return the inverse squared length of a vector, or that of the smallest length."""
+    return 1.0 / max(x * x + y * y, LENGTH_MIN)
+
+
+@scalar
+def bernstein(t):
+    """Return the weights of the control points of a cubic at t: see :func:`.response.bernstein`."""
+    s = ONE - t
+    return s * s * s, THREE * s * s * t, THREE * s * t * t, t * t * t
+
+
+@scalar
+def weights_of(piece, f):
+    """Return the weights of the control points for a point on a piece of their curve.
+
+    Vertices are multiples of 1/8 along a cubic, whose weights are exact in float32.
+    """
+    g, beyond = ONE - f, ONE + f
+    is_edge, is_first = piece < _N_EDGES, piece < _N_EDGES + HALF
+    a, b = bernstein(piece * _EDGE), bernstein((piece + ONE) * _EDGE)
+    return (
+        select(is_edge, g * a[0] + f * b[0], select(is_first, beyond, ZERO)),
+        select(is_edge, g * a[1] + f * b[1], ZERO),
+        select(is_edge, g * a[2] + f * b[2], ZERO),
+        select(is_edge, g * a[3] + f * b[3], select(is_first, ZERO, beyond)),
+    )
+
+
+def _points_gradient(n_curves: int, first: int = 0) -> Callable:
+    """Return a function that gives the gradient of all control points, which is 0 for those of other curves."""
+    first_piece, next_piece = np.float32(N_INVERSES * first), np.float32(N_INVERSES * (first + 1))
 
     @scalar
-    def own(curve, v):
-        is_own = abs(curve - number) < HALF
-        return (
-            select(is_own, v[0], ZERO),
-            select(is_own, v[1], ZERO),
-            select(is_own, v[2], ZERO),
-            select(is_own, v[3], ZERO),
-            select(is_own, v[4], ZERO),
-            select(is_own, v[5], ZERO),
-            select(is_own, v[6], ZERO),
-            select(is_own, v[7], ZERO),
-        )
+    def own(piece, f, v):
+        w_0, w_1, w_2, w_3 = weights_of(piece - first_piece, f)
+        return w_0 * v[0], w_0 * v[1], w_1 * v[0], w_1 * v[1], w_2 * v[0], w_2 * v[1], w_3 * v[0], w_3 * v[1]
 
-    if first + 1 == n_curves:
+    if n_curves == 1:
         return own
-    of_others = _spread(n_curves, first + 1)
+    of_others = _points_gradient(n_curves, first + 1) if first + 1 < n_curves else scalar(lambda piece, f, v: ())
 
     @scalar
-    def own_and_others(curve, v):
-        return own(curve, v) + of_others(curve, v)
+    def own_and_others(piece, f, v):
+        is_own = (piece >= first_piece) & (piece < next_piece)
+        v_x, v_y = select(is_own, v[0], ZERO), select(is_own, v[1], ZERO)
+        return own(piece, f, (v_x, v_y)) + of_others(piece, f, v)
 
     return own_and_others
 
 
 def response_for(n_curves: int, dtype: np.dtype) -> KernelResponse:
     """Return the response for M curves and arrays of a dtype: float32 data use the polynomial exponential."""
-    return make_cut_response(choose_exponential(dtype), n_curves)
+    return make_cut_response(exp_fast if dtype == np.float32 else exp_wide, n_curves)
+
+
+@kernel()
+def _write_curves(points, vertices_at, inverses_at, records):
+    """Write the vertices of all curves, and the inverse squared lengths of their pieces, computed in float64."""
+    for n in prange(len(points)):
+        for k in range(points.shape[1] // N_POINTS):
+            o_x, o_y = DOUBLE, DOUBLE
+            for i in range(N_EDGES + 1):
+                weights, x, y = bernstein(np.float64(i * _EDGE)), DOUBLE, DOUBLE
+                for j in range(N_POINTS):
+                    x += weights[j] * points[n, N_POINTS * k + j, 0]
+                    y += weights[j] * points[n, N_POINTS * k + j, 1]
+                at, pieces_at = vertices_at + N_VERTICES * k + 2 * i, inverses_at + N_INVERSES * k
+                records[n, at], records[n, at + 1] = x, y
+                if i > 0:
+                    records[n, pieces_at + i - 1] = inverse_square(x - o_x, y - o_y)
+                if i == 0 or i == N_EDGES:  # the rays
+                    records[n, pieces_at + N_EDGES + i // N_EDGES] = inverse_square(x, y)
+                o_x, o_y = x, y
 
 
 def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype) -> Floats:
-    points, widths = footprints.points.astype(np.float64), footprints.widths
-    n, n_curves = len(points), points.shape[1] // N_POINTS
-    columns = columns_of(n_curves)
-    vertices = np.einsum("ij,nmjk->nmik", VERTICES, points.reshape(n, n_curves, N_POINTS, 2))  # [N, M, N_EDGES + 1, 2]
-    pieces = np.concatenate([np.diff(vertices, axis=2), vertices[:, :, [0, -1]]], axis=2)
-    records = np.zeros((n, columns.n), dtype)
+    points, widths = np.ascontiguousarray(footprints.points), footprints.widths
+    columns = columns_of(points.shape[1] // N_POINTS)
+    records = np.zeros((len(points), columns.n), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
     records[:, columns.depth], records[:, columns.width] = footprints.projection.depths, widths
+    records[:, columns.alpha_min] = footprints.alpha_min
     records[:, columns.inverse_width] = np.where(widths > 0, 1 / np.where(widths > 0, widths, 1), 0)
-    records[:, columns.vertices : columns.inverses] = vertices.reshape(n, columns.inverses - columns.vertices)
-    records[:, columns.inverses :] = 1 / np.maximum(np.sum(pieces**2, axis=3), LENGTH_MIN).reshape(
-        n, columns.n - columns.inverses
-    )
+    _write_curves(points, columns.vertices, columns.inverses, records)
     return records
 
 

@@ -82,7 +82,7 @@ def _footprints(projected: Projected) -> CutFootprints:
     g, rows = projected.gaussians, projected.rows
     points = np.zeros((len(g.curves), g.curves.shape[1] // 2, 2), g.means.dtype)
     points[rows] = image_points(g.curves[rows], projected.of(rows), projected.camera, projected.conventions)
-    return CutFootprints(projected.projection, points, g.widths)
+    return CutFootprints(projected.projection, points, g.widths, projected.conventions.alpha_min)
 
 
 def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradient:

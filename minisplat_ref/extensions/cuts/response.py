@@ -170,7 +170,7 @@ def image_points(curves: Floats, primitives: Primitives, camera: Camera, convent
         As for the projection.
     """
     *_, M = _maps(primitives, camera, conventions)
-    return np.einsum("nik,njk->nji", M, _by_points(curves))
+    return np.asarray(_by_points(curves) @ np.swapaxes(M, 1, 2))
 
 
 class PointsGradient(NamedTuple):
@@ -199,20 +199,20 @@ def image_points_vjp(
     x, R, J, M = _maps(primitives, camera, conventions)
     R_c, _ = pose(camera, means.dtype)
     G = (R_c @ R)[:, :, :2]
-    v_M = np.einsum("nji,njk->nik", v_points, _by_points(curves))  # [N, 2, 2]
-    v_J = np.einsum("nik,nlk,nk->nil", v_M, G, scales[:, :2])
-    v_GS = np.einsum("nil,nik->nlk", J, v_M)  # [N, 3, 2]
+    v_M = np.swapaxes(v_points, 1, 2) @ _by_points(curves)  # [N, 2, 2]
+    v_J = v_M @ np.swapaxes(G * scales[:, None, :2], 1, 2)
+    v_GS = np.swapaxes(J, 1, 2) @ v_M  # [N, 3, 2]
     v_G, v_scales = np.zeros_like(R), np.zeros_like(scales)
     v_G[:, :, :2] = v_GS * scales[:, None, :2]
     v_scales[:, :2] = np.sum(G * v_GS, axis=1)
     seen = with_principal_point(camera, conventions)
     v_x = pinhole_jacobians_vjp(x, seen, *slope_limits(seen, conventions, means.dtype), v_J)
     return PointsGradient(
-        curves=np.einsum("nik,nji->njk", M, v_points).reshape(curves.shape),
+        curves=(v_points @ M).reshape(curves.shape),
         means=v_x @ R_c,
         quats=rotation_matrices_vjp(quats, R_c.T @ v_G),
         scales=v_scales,
-        cam_from_world_R=np.einsum("nij,nkj->ik", v_G, R) + v_x.T @ means,
+        cam_from_world_R=np.sum(v_G @ np.swapaxes(R, 1, 2), axis=0) + v_x.T @ means,
         cam_from_world_t=v_x.sum(axis=0),
     )
 
@@ -243,6 +243,8 @@ class CutFootprints(Footprints):
     """[N, 4 M, 2] control points of M curves, px from the centre."""
     widths: Floats
     """[N] w of the mask, px."""
+    alpha_min: float
+    """Of the conventions: kernels do not evaluate cuts where alpha is smaller without them."""
 
 
 FIELDS = (*CONIC.fields, "points")
