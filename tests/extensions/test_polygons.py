@@ -17,13 +17,14 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons import model
-from minisplat_ref.extensions.polygons.kernels import TRIANGLE
 from minisplat_ref.extensions.polygons.kernels import build_tree as triangle_tree
+from minisplat_ref.extensions.polygons.kernels import meet as meet_triangle
 from minisplat_ref.extensions.polygons.model import (
     LOG_THICKNESS,
     TRACED,
     Polygons,
     make_fans,
+    make_image_tracer,
     make_polygons,
     make_tracer,
     press_flat,
@@ -197,7 +198,7 @@ def test_polygons_triangles_and_the_reference_agree(n, n_sides, rng):
     targets = np.concatenate([polygons.means, rng.normal((0, 0, 3), 1, (100, 3))])  # also straight at the centres
     origins = rng.normal(size=(len(targets), 3))
     rays = rays_along(origins, targets - origins)
-    triangles = kernels.tracer_of(TRIANGLE, triangle_tree(make_fans(polygons), GSPLAT_MAIN))
+    triangles = kernels.tracer_of(meet_triangle, triangle_tree(make_fans(polygons), GSPLAT_MAIN))
     theirs = hits_of(polygons, rays, REFERENCE)
     assert len(theirs.ray_ids) >= n
     for ours in (hits_of(polygons, rays, CPU), triangles.list_hits(rays, GSPLAT_MAIN)):
@@ -205,38 +206,6 @@ def test_polygons_triangles_and_the_reference_agree(n, n_sides, rng):
             assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
         for name in ("unclamped", "depths", "weights", "transmittances"):
             assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=PLANE_DEPTH, err_msg=name)
-
-
-def test_the_gradient_of_triangles_is_that_of_their_polygon(rng):
-    """Of quaternions and scales: spans that shear, which no Gaussian has, are other polygons and other triangles."""
-    g, rays, found = make_gaussians(rng, 20), pixel_rays(make_camera(), GSPLAT_MAIN), []
-    polygons, colors = make_polygons(g, 1 / (1 + np.exp(-g.opacity_logits))), rng.uniform(size=(20, 3))
-    v_image, v_depths, v_T = (rng.normal(size=(len(rays.near), *shape)) for shape in ((3,), (), ()))
-    triangles = kernels.tracer_of(TRIANGLE, triangle_tree(make_fans(polygons), GSPLAT_MAIN))
-    for tracer in (make_tracer(polygons, GSPLAT_MAIN, CPU), triangles):
-        blended = tracer.blend(colors, rays, BLACK, GSPLAT_MAIN)
-        v = tracer.blend_vjp(colors, rays, BLACK, GSPLAT_MAIN, blended, (v_image, v_depths, v_T))
-        v_quats, v_log_scales = spans_vjp(g, polygons, v.shapes)
-        found.append((v.means, v_quats, v_log_scales, v.opacities, v.colors, v.origins, v.directions))
-    for ours, theirs in zip(*found, strict=True):
-        assert np.abs(theirs).max() > 0
-        assert np.abs(ours - theirs).max() <= PARITY_FLOAT64 * np.abs(theirs).max()
-
-
-def test_a_ray_whose_hits_find_no_room_is_traced_again(rng, monkeypatch):
-    """The gradient and the list do not depend on how many hits the forward pass could keep."""
-    polygons, rays = random_polygons(rng, 20), pixel_rays(make_camera(), GSPLAT_MAIN)
-    colors, found = rng.uniform(size=(20, 3)), []
-    v_blended = np.ones((len(rays.near), 3)), np.ones(len(rays.near)), np.ones(len(rays.near))
-    for room in (kernels.HITS_KEPT_MAX, 3):
-        monkeypatch.setattr(kernels, "HITS_KEPT_MAX", room)
-        tracer = make_tracer(polygons, GSPLAT_MAIN, CPU)
-        blended = tracer.blend(colors, rays, BLACK, GSPLAT_MAIN)
-        assert (blended.kept is None) == (room == 3)
-        v = tracer.blend_vjp(colors, rays, BLACK, GSPLAT_MAIN, blended, v_blended)
-        found.append((*tracer.list_hits(rays, GSPLAT_MAIN), *v))
-    for ours, theirs in zip(*found, strict=True):
-        assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize(
@@ -329,13 +298,36 @@ def test_what_cannot_be_drawn_is_left_out(rng):
     for backend in (CPU, REFERENCE):
         images = []
         for polygons in (good, both):
-            tracer, ones = make_tracer(polygons, GSPLAT_MAIN, backend), np.ones((len(polygons.means), 3))
+            tracer = make_image_tracer(polygons, make_camera(), GSPLAT_MAIN, backend)
+            ones = np.ones((len(polygons.means), 3))
             blended = tracer.blend(ones, rays, BLACK, GSPLAT_MAIN)
             v = tracer.blend_vjp(ones, rays, BLACK, GSPLAT_MAIN, blended, (blended.image, rays.near, rays.near))
             assert all(np.isfinite(array).all() for array in (*blended[:5], *v))
             images.append(blended.image)
         assert images[0].max() > COVERAGE_MIN
         assert_array_equal(images[0], images[1])
+
+
+@pytest.mark.parametrize("n_sides", [3, 8])
+def test_lists_of_tiles_hold_polygons_on_all_sides_of_a_camera(n_sides, rng):
+    """Polygons beside, around and partly behind the camera, and some in a plane with it, are hit as in the reference."""
+    g = make_gaussians(rng, 200, size=0.6)._replace(means=rng.normal(0, 1.5, (200, 3)))
+    polygons, camera = make_polygons(g, 1 / (1 + np.exp(-g.opacity_logits)), n_sides), make_camera(29, 21)
+    polygons.spans[:5, :, 1] = polygons.means[:5] / 3  # the camera is at the origin
+    rays, colors, found = pixel_rays(camera, GSPLAT_MAIN), rng.uniform(size=(200, 3)), []
+    v_blended = tuple(rng.normal(size=(len(rays.near), *shape)) for shape in ((3,), (), ()))
+    for backend in (CPU, REFERENCE):
+        tracer = make_image_tracer(polygons, camera, GSPLAT_MAIN, backend)
+        blended = tracer.blend(colors, rays, BLACK, GSPLAT_MAIN)
+        v = tracer.blend_vjp(colors, rays, BLACK, GSPLAT_MAIN, blended, v_blended)
+        found.append((tracer.list_hits(rays, GSPLAT_MAIN), v))
+    (ours, v_ours), (theirs, v_theirs) = found
+    assert len(theirs.ray_ids) > 1000
+    assert_array_equal(ours.offsets, theirs.offsets)
+    assert_array_equal(ours.gaussian_ids, theirs.gaussian_ids)
+    assert_allclose(ours.weights, theirs.weights, rtol=PLANE_DEPTH)
+    for name, expected in v_theirs._asdict().items():
+        assert np.abs(getattr(v_ours, name) - expected).max() <= PLANE_DEPTH * np.abs(expected).max(), name
 
 
 def test_hidden_rows_are_not_drawn_and_too_much_is_refused(backend, rng):

@@ -19,6 +19,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import model
+from minisplat_ref.extensions.rays.kernels import whitening_maps, whitening_maps_vjp
 from minisplat_ref.extensions.rays.model import (
     TRACED,
     Whitened,
@@ -132,6 +133,28 @@ def test_the_gradient_of_maps_and_of_pixels(rng):
         [camera.cam_from_world_R, camera.cam_from_world_t],
         names=["R", "t"],
     )
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("n", [1, 21])
+def test_maps_by_kernels(n, dtype, rng):
+    """The same as in NumPy, also where no ray meets a Gaussian without a finite size, and where a quaternion is long."""
+    g = as_dtype(make_gaussians(rng, n), dtype)
+    g.quats[0] *= 1e20 if dtype == np.float64 else 1e10
+    gaussians = whiten_model(Model(g))
+    maps, v_maps = whitening_maps(g.quats, g.log_scales), rng.normal(size=(n, 3, 3))
+    assert_allclose(maps, gaussians.maps, rtol=CLOSED_FORM, atol=CLOSED_FORM)
+    for ours, theirs in zip(
+        whitening_maps_vjp(g.quats, g.log_scales, maps, v_maps),
+        whiten_vjp(g.quats, g.log_scales, gaussians, v_maps),
+        strict=True,
+    ):
+        assert_allclose(ours, theirs, rtol=CLOSED_FORM, atol=CLOSED_FORM * np.abs(theirs).max())
+    g.log_scales[0], v_maps[0] = [-2000, 2000, np.nan], 0
+    infinite = whitening_maps(g.quats, g.log_scales)
+    v = whitening_maps_vjp(g.quats, g.log_scales, infinite, v_maps)
+    assert not np.isfinite(infinite[0]).all()
+    assert all(np.isfinite(array).all() and not array[0].any() for array in v)
 
 
 # --- many Gaussians ---

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast, exp_wide
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
@@ -150,11 +150,13 @@ def test_any_sees_every_lane(lane):
     assert found(a) and reduce_any(a > 0.5)
 
 
-def test_power_of_two_is_added_to_the_exponent(rng):
+@pytest.mark.parametrize(("dtype", "lowest"), [(np.float32, -60), (np.float64, -1000)])
+def test_power_of_two_is_added_to_the_exponent(dtype, lowest, rng):
     def run(a, n, out):
         store(out, 0, ldexp(load(a, 0), load(n, 0)))
 
-    a, n = rng.uniform(0.7, 1.4, WIDTH).astype(np.float32), rng.integers(-60, 1, WIDTH).astype(np.float32)
+    a, n = rng.uniform(0.7, 1.4, WIDTH).astype(dtype), rng.integers(lowest, 1, WIDTH).astype(dtype)
+    n[0] = lowest
     fast, plain = two_ways(run, a, n, np.zeros_like(a))
     assert_array_equal(fast, plain)
     assert_array_equal(fast, a * np.exp2(n))
@@ -262,3 +264,13 @@ def test_exponentials():
     out = far.copy()
     run(exp_fast)(far, out)
     assert_allclose(out, 2.0**-60, rtol=6e-7)
+    x = np.concatenate([-np.linspace(0, 6, 8000), -np.linspace(6, 690, 8000)])
+    out, expected = np.zeros_like(x), np.exp(x.astype(np.longdouble))
+    run(exp_wide)(x, out)
+    assert np.abs(out / expected - 1).max() < 4e-16  # of the docstring
+    assert np.abs(exp_wide(x) / expected - 1).max() < 1e-15  # in Python, where no products are contracted
+    far = np.array([-700.0, -1e300, -np.inf, 0.0, -0.0, -1e-300, -800.0, -750.0])
+    out = far.copy()
+    run(exp_wide)(far, out)
+    assert_allclose(out[[0, 3, 4, 5]], [np.exp(-700.0) if np.exp(-700.0) > 2.0**-1000 else out[0], 1, 1, 1], rtol=4e-16)
+    assert (out[[1, 2, 6, 7]] <= 2.0**-1000).all()

@@ -12,8 +12,7 @@ import numpy as np
 
 from minisplat_ref.cpu.compositing.exponential import exp_fast, exp_wide
 from minisplat_ref.cpu.compositing.responses import CONIC_GRADIENTS, MEAN_X, OPACITY, KernelResponse, conic_response
-from minisplat_ref.cpu.gaussian_rows import DOUBLE
-from minisplat_ref.extensions.cuts.response import LENGTH_MIN, N_EDGES, N_POINTS, CutFootprints
+from minisplat_ref.extensions.cuts.response import LENGTH_MIN, N_EDGES, N_POINTS, CutFootprints, vertices_of
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import broadcast, maximum, minimum, reduce_any, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, THREE, ZERO
@@ -231,34 +230,32 @@ def response_for(n_curves: int, dtype: np.dtype) -> KernelResponse:
 
 
 @kernel()
-def _write_curves(points, vertices_at, inverses_at, records):
-    """Write the vertices of all curves, and the inverse squared lengths of their pieces, computed in float64."""
-    for n in prange(len(points)):
-        for k in range(points.shape[1] // N_POINTS):
-            o_x, o_y = DOUBLE, DOUBLE
+def _write_curves(vertices, vertices_at, inverses_at, records):
+    """Write the vertices of all curves, and the inverse squared lengths of their pieces."""
+    for n in prange(len(vertices)):
+        for k in range(vertices.shape[1]):
+            at, pieces_at, last = vertices_at + N_VERTICES * k, inverses_at + N_INVERSES * k, vertices[n, k, N_EDGES]
             for i in range(N_EDGES + 1):
-                weights, x, y = bernstein(np.float64(i * _EDGE)), DOUBLE, DOUBLE
-                for j in range(N_POINTS):
-                    x += weights[j] * points[n, N_POINTS * k + j, 0]
-                    y += weights[j] * points[n, N_POINTS * k + j, 1]
-                at, pieces_at = vertices_at + N_VERTICES * k + 2 * i, inverses_at + N_INVERSES * k
-                records[n, at], records[n, at + 1] = x, y
-                if i > 0:
-                    records[n, pieces_at + i - 1] = inverse_square(x - o_x, y - o_y)
-                if i == 0 or i == N_EDGES:  # the rays
-                    records[n, pieces_at + N_EDGES + i // N_EDGES] = inverse_square(x, y)
-                o_x, o_y = x, y
+                records[n, at + 2 * i], records[n, at + 2 * i + 1] = vertices[n, k, i, 0], vertices[n, k, i, 1]
+            for i in range(N_EDGES):
+                u_x = vertices[n, k, i + 1, 0] - vertices[n, k, i, 0]
+                u_y = vertices[n, k, i + 1, 1] - vertices[n, k, i, 1]
+                records[n, pieces_at + i] = inverse_square(u_x, u_y)
+            records[n, pieces_at + N_EDGES] = inverse_square(vertices[n, k, 0, 0], vertices[n, k, 0, 1])
+            records[n, pieces_at + N_EDGES + 1] = inverse_square(last[0], last[1])
 
 
 def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype) -> Floats:
-    points, widths = np.ascontiguousarray(footprints.points), footprints.widths
-    columns = columns_of(points.shape[1] // N_POINTS)
-    records = np.zeros((len(points), columns.n), dtype)
+    points, widths = footprints.points.astype(np.float64), footprints.widths
+    n, n_curves = len(points), points.shape[1] // N_POINTS
+    columns = columns_of(n_curves)
+    records = np.zeros((n, columns.n), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
     records[:, columns.depth], records[:, columns.width] = footprints.projection.depths, widths
     records[:, columns.alpha_min] = footprints.alpha_min
     records[:, columns.inverse_width] = np.where(widths > 0, 1 / np.where(widths > 0, widths, 1), 0)
-    _write_curves(points, columns.vertices, columns.inverses, records)
+    vertices = vertices_of(points.reshape(n, n_curves, N_POINTS, 2))
+    _write_curves(vertices, columns.vertices, columns.inverses, records)
     return records
 
 

@@ -59,6 +59,15 @@ TOPS = np.concatenate([np.ones(N_EDGES), np.full(2, 1e9)])  # largest f
 N_PIECES = len(TOPS)  # of a curve
 
 
+def vertices_of(curves: Floats) -> Floats:
+    """Return the vertices [..., N_EDGES + 1, 2] of curves [..., 4, 2], with the same rounding for both backends.
+
+    It decides on which side a curve through the centre passes it.
+    """
+    w, P = VERTICES.astype(curves.dtype)[:, :, None], curves[..., None, :, :]  # [N_EDGES + 1, 4, 1], [..., 1, 4, 2]
+    return np.asarray(w[:, 0] * P[..., 0, :] + w[:, 1] * P[..., 1, :] + w[:, 2] * P[..., 2, :] + w[:, 3] * P[..., 3, :])
+
+
 def repeat_for_curves(weights: Floats, n: int) -> Floats:
     """Return weights [K, 4] of one curve's points as those [n K, 4 n] of n curves with four points each."""
     return np.kron(np.eye(n), weights)
@@ -120,7 +129,7 @@ def count_crossings(points: Floats, offsets: Floats) -> Ints:
     both or none.
     """
     curves = points.reshape(len(points), points.shape[1] // N_POINTS, N_POINTS, 2)  # [G, M, 4, 2]
-    V = np.einsum("ij,gmjk->gmik", VERTICES.astype(points.dtype), curves)[:, None]  # [G, 1, M, N_EDGES + 1, 2]
+    V = vertices_of(curves)[:, None]  # [G, 1, M, N_EDGES + 1, 2]
     d = offsets[:, :, None, None]
     is_left = _cross(d, V) > 0  # [G, P, M, N_EDGES + 1]
     o, u = V[:, :, :, :-1], np.diff(V, axis=3)
