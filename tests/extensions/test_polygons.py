@@ -310,7 +310,7 @@ def test_what_cannot_be_drawn_is_left_out(rng):
 
 @pytest.mark.parametrize("n_sides", [3, 8])
 def test_lists_of_tiles_hold_polygons_on_all_sides_of_a_camera(n_sides, rng):
-    """Polygons beside, around and partly behind the camera, and some in a plane with it, are hit as in the reference."""
+    """Polygons beside, around and partly behind the camera, some in a plane with it, are hit as in the reference."""
     g = make_gaussians(rng, 200, size=0.6)._replace(means=rng.normal(0, 1.5, (200, 3)))
     polygons, camera = make_polygons(g, 1 / (1 + np.exp(-g.opacity_logits)), n_sides), make_camera(29, 21)
     polygons.spans[:5, :, 1] = polygons.means[:5] / 3  # the camera is at the origin

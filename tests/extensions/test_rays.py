@@ -138,7 +138,7 @@ def test_the_gradient_of_maps_and_of_pixels(rng):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("n", [1, 21])
 def test_maps_by_kernels(n, dtype, rng):
-    """The same as in NumPy, also where no ray meets a Gaussian without a finite size, and where a quaternion is long."""
+    """The same as in NumPy, also of a Gaussian without a finite size that no ray meets, and of a long quaternion."""
     g = as_dtype(make_gaussians(rng, n), dtype)
     g.quats[0] *= 1e20 if dtype == np.float64 else 1e10
     gaussians = whiten_model(Model(g))

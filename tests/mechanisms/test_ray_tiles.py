@@ -1,4 +1,4 @@
-"""The lists of an image's tiles: bounds of ellipsoids, order, and rays by the lists against every ray with every row."""
+"""The lists of an image's tiles: bounds of ellipsoids, order, and rays by these lists against all pairs."""
 
 import numpy as np
 import pytest
@@ -23,9 +23,7 @@ def around_the_camera(rng, n, camera=CAMERA, size=0.4):
     """Gaussians at all sides of a camera and around it, thin and thick."""
     places = rng.normal(0, 1, (n, 3)) * rng.uniform(0.1, 3, (n, 1))
     scales = size * np.exp(rng.uniform(-2, 0.7, (n, 3)))
-    return whiten(
-        in_front_of(camera, places), rng.normal(size=(n, 4)), np.log(scales), rng.uniform(0.05, 0.95, n)
-    )
+    return whiten(in_front_of(camera, places), rng.normal(size=(n, 4)), np.log(scales), rng.uniform(0.05, 0.95, n))
 
 
 def both_ways(gaussians, camera=CAMERA, conventions=GSPLAT_MAIN):

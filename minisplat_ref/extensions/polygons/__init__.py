@@ -11,7 +11,7 @@ The ray of each pixel takes alpha where it hits the polygon:
     alpha = min(alpha_max, o exp(-(u^2 + v^2) / 2))      (u, v): the place in the plane, in standard deviations
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
-(``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with a polygon instead of an ellipsoid
+(``mechanisms.rays.tile_kernels``), with a polygon instead of an ellipsoid
 (:mod:`.ray_kernels`, in NumPy :mod:`.model`). An edited polygon may be bent, and then a ray hits the triangles
 between its centre and two neighbouring corners (:mod:`.kernels`); of a flat one, both give the same hits.
 

@@ -14,7 +14,8 @@ There is no plane of the whole polygon here, and no axes: these kernels render t
 neither; whole polygons are traced by :mod:`.ray_kernels`. Of a spoke, the triangle before it has the points; of the
 centre, the first triangle. Neighbours take the same product ``p . e``, and so no ray slips through between them.
 
-The loops are those of ``mechanisms.rays.traversal`` and ``mechanisms.rays.kernels``.
+The loops are those of ``mechanisms.rays.traversal`` and ``mechanisms.rays.kernels``. An edited mesh is not trained, so
+there is no gradient.
 """
 
 from typing import NamedTuple

@@ -231,7 +231,8 @@ def build_tree(polygons: Polygons, conventions: Conventions) -> RayTree:
     seen = np.flatnonzero(is_seen & np.isfinite(corners).all(axis=(1, 2)))
     tree = build(corners[seen].min(axis=1), corners[seen].max(axis=1))
     ids = seen[tree.rows]
-    records = make_records(*(field[ids] for field in polygons[:4]), polygons.n_sides)
+    means, spans, radii, opacities = (field[ids] for field in polygons[:4])
+    records = make_records(means, spans, radii, opacities, polygons.n_sides)
     return RayTree(records, ids.astype(np.int32), tree.boxes, tree.children, len(polygons.means))
 
 
@@ -242,9 +243,7 @@ def make_tracer(polygons: Polygons, conventions: Conventions, backend: Backend) 
     return blending.tracer_of(prepare_meeting(polygons))
 
 
-def make_image_tracer(
-    polygons: Polygons, camera: Camera, conventions: Conventions, backend: Backend
-) -> ImageTracer:
+def make_image_tracer(polygons: Polygons, camera: Camera, conventions: Conventions, backend: Backend) -> ImageTracer:
     """Return the tracer of a camera's image: every ray against every polygon, or kernels with lists of its tiles."""
     if backend.is_compiled:
         lists = list_tiles(find_ellipsoids(polygons, conventions), camera, conventions)

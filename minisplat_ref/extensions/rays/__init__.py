@@ -1,4 +1,4 @@
-"""Ray tracing of Gaussians: a tree of boxes, shadows, mirrors, glass, meshes.
+"""Ray tracing of Gaussians: lists of tiles, a tree of boxes, shadows, mirrors, glass, meshes.
 
 This follows RaySplats, Byrski et al. 2025, arXiv 2501.19196. Nothing is projected. A Gaussian is evaluated at the point
 of the pixel's ray ``O + t d`` where its density is greatest:
@@ -8,7 +8,8 @@ of the pixel's ray ``O + t d`` where its density is greatest:
 
 Each ray blends its own hits in the order of t, with the weights of 3DGS. So ellipsoids are exact at any angle, no
 Gaussian pops in front of another when the camera turns, and rays may start anywhere: shadows, mirrors, glass and
-triangles need no new formula (:mod:`.lights`). A bounding volume hierarchy skips Gaussians that a ray does not come
+triangles need no new formula (:mod:`.lights`). The rays of an image test the Gaussians of their tile's list
+(``mechanisms.rays.tile_lists``). For all others a bounding volume hierarchy skips Gaussians that a ray does not come
 near (``mechanisms.rays.bvh``).
 
 This deviates from the paper as follows. A Gaussian ends where alpha falls below ``alpha_min`` = 1/255, as in 3DGS, and

@@ -118,7 +118,7 @@ def size(v):
 
 @scalar
 def map_row_vjp(is_met, M_i, v_M_i, log_s):
-    """Return ``v_log_s_i = -M_i . v_M_i`` and column i of v_R, ``v_M_i / s_i``; zeros for Gaussians that no ray meets."""
+    """Return ``v_log_s_i = -M_i . v_M_i`` and column i of v_R, ``v_M_i / s_i``; zeros where no ray meets a Gaussian."""
     inverse = libm_exp(-log_s)
     along = M_i[0] * v_M_i[0] + M_i[1] * v_M_i[1] + M_i[2] * v_M_i[2]
     of_R = (

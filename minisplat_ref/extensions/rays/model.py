@@ -190,8 +190,9 @@ def prepare_meeting(gaussians: Whitened) -> Meeting:
 
 
 def find_ellipsoids(gaussians: Whitened, conventions: Conventions) -> Ellipsoids:
-    """Return the ellipsoids ``|M x|^2 = q`` on which alpha is ``alpha_min``: ``Sigma = M^-1 M^-T``, row i of M is
-    ``R_i / s_i``. The reach q of Gaussians that are too faint or not finite is not above 0.
+    """Return the ellipsoids ``|M x|^2 = q`` on which alpha is ``alpha_min``; q is below 0 where none can be seen.
+
+    ``Sigma = M^-1 M^-T``, and row i of M is ``R_i / s_i``.
     """
     least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -239,9 +240,7 @@ def make_tracer(gaussians: Whitened, conventions: Conventions, backend: Backend)
     return blending.tracer_of(prepare_meeting(gaussians))
 
 
-def make_image_tracer(
-    gaussians: Whitened, camera: Camera, conventions: Conventions, backend: Backend
-) -> ImageTracer:
+def make_image_tracer(gaussians: Whitened, camera: Camera, conventions: Conventions, backend: Backend) -> ImageTracer:
     """Return the tracer of a camera's image: every ray against every Gaussian, or kernels with lists of its tiles."""
     if backend.is_compiled:
         ellipsoids = find_ellipsoids(gaussians, conventions)
@@ -257,9 +256,7 @@ def _prepare(population: Any, opacities: Floats, backend: Backend) -> Whitened:
     return whiten(population.means, population.quats, population.log_scales, opacities)
 
 
-def _shapes_vjp(
-    population: Any, gaussians: Whitened, v_maps: Floats, backend: Backend
-) -> tuple[Floats, Floats]:
+def _shapes_vjp(population: Any, gaussians: Whitened, v_maps: Floats, backend: Backend) -> tuple[Floats, Floats]:
     if backend.is_compiled:
         return whitening_maps_vjp(population.quats, population.log_scales, gaussians.maps, v_maps)
     return whiten_vjp(population.quats, population.log_scales, gaussians, v_maps)

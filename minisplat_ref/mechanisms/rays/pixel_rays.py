@@ -177,7 +177,7 @@ def blend_stats(hits: Hits, size: tuple[int, int], n: int) -> BlendStats:
 
 
 def _slopes(camera: Camera) -> tuple[Floats, Floats]:
-    """Return (x, 0, 0) [W, 3] and (0, y, 0) [H, 3]: a ray's direction in the camera frame is their sum and (0, 0, 1)."""
+    """Return (x, 0, 0) [W, 3] and (0, y, 0) [H, 3]: with (0, 0, 1) they add up to rays in the camera frame."""
     across = pinhole_rays(np.arange(camera.width) + 0.5, camera.cy, camera)
     down = pinhole_rays(camera.cx, np.arange(camera.height) + 0.5, camera)
     return across * [1, 0, 0], down * [0, 1, 0]

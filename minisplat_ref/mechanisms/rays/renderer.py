@@ -37,8 +37,8 @@ class Traced(NamedTuple):
     tracer_for: Callable[[Any, Camera, Conventions, Backend], ImageTracer]
     """``tracer_for(prepared, camera, conventions, backend)``: the tracer of a backend; lists are made here."""
     shapes_vjp: Callable[[Any, Any, Floats, Backend], tuple[Floats, Floats]]
-    """``shapes_vjp(population, prepared, v_shapes, backend)``: the gradient with respect to quaternions [N, 4] and logarithms of
-    scales [N, 3]."""
+    """``shapes_vjp(population, prepared, v_shapes, backend)``: the gradient with respect to quaternions [N, 4] and
+    logarithms of scales [N, 3]."""
 
 
 def make_ray_renderer(traced: Traced) -> Renderer:

@@ -1,9 +1,9 @@
 """Rays through the pixels of an image, forward and back, by the lists of its tiles.
 
-A tile has eight packets of eight rays. A packet tests the primitives of its tile whose boxes it overlaps, nearest first,
-until none can be nearer than the last hit that counts; then each ray sorts its hits by t, ties by row, and blends them.
-What a ray loses on its hits is at most what it loses on all, so once those that it has found let less light through
-than it may end with, nothing beyond the farthest of them counts.
+A tile has eight packets of eight rays. A packet tests the primitives of its tile whose boxes it overlaps, nearest
+first, until all others begin behind the last hit that counts; then each ray sorts its hits by t, ties by row, and
+blends them. Once the hits that a ray has found let less light through than it may end with, nothing beyond the farthest
+of them counts, because other primitives in front can only dim the ray more.
 
 The gradient needs no lock and depends on no order of threads: each tile adds the contributions of its rays to separate
 rows, one for each primitive in its list, and each primitive then sums its rows in the order of the tiles.
@@ -169,7 +169,7 @@ def _padding(n: int) -> Callable:
 
     @scalar
     def pad(v, value):
-        return pad_rest(v + (value,), value)
+        return pad_rest((*v, value), value)
 
     return pad
 
@@ -337,7 +337,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         d_x, d_y, d_z = d_x + of_direction[0], d_y + of_direction[1], d_z + of_direction[2]
                         of_opacity = unclamped * v_unclamped / records[row, OPACITY]
                         of_color = (weight * v_image[0], weight * v_image[1], weight * v_image[2])
-                        sums = of_mean + (of_opacity,) + of_color + pad(of_shape, zero)
+                        sums = (*of_mean, of_opacity, *of_color, *pad(of_shape, zero))
                         at = N_SUMS * (first + j)
                         accumulate(v_pairs, at, reduce_sums(sums[:8]))
                         accumulate(v_pairs, at + WIDTH, reduce_sums(sums[8:]))
@@ -436,8 +436,9 @@ def _blend(
 ) -> tuple[BlendedRays, int]:
     """Return the colours of the rays, with their hits if these fit into ``room``, and the room that they need."""
     n_rays, n = len(rays.near), len(primitives.records)
-    image, depths, transmittances, is_seen = np.empty((n_rays, 3)), np.empty(n_rays), np.empty(n_rays), np.zeros(n, bool)
-    starts, n_hits, n_used = np.empty(n_rays, np.int64), np.empty(n_rays, np.int64), np.zeros(1, np.int64)
+    image, depths, transmittances = np.empty((n_rays, 3)), np.empty(n_rays), np.empty(n_rays)
+    is_seen, n_used = np.zeros(n, bool), np.zeros(1, np.int64)
+    starts, n_hits = np.empty((2, n_rays), np.int64)
     room_with_rest = 1 << (room - 1).bit_length() if room > 0 else 0  # so that its memory fits the next image, too
     hits = large_empty((room_with_rest, 4), np.dtype(np.float64))[:room]
     kept = KeptHits(starts, n_hits, hits, n_used)

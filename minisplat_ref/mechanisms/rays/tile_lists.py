@@ -5,10 +5,9 @@ The plane ``a = u z`` through the camera, for a = x or y, touches it where
 
     (m_a - u m_z)^2 = q (Sigma_aa - 2 u Sigma_az + u^2 Sigma_zz)
 
-a quadratic in u, whose roots are the ellipsoid's bounds on the image. If it reaches behind the camera, it has one bound,
-or none where it surrounds the axis. Its smallest z is ``m_z - sqrt(q Sigma_zz)``. Since t on a pixel's ray is z, that
-is a lower bound of t for all rays, by which a list is sorted: a ray ends with the first entry that is farther than its
-last hit that counts.
+a quadratic in u, whose roots are the ellipsoid's bounds on the image. If it reaches behind the camera, it has one
+bound, or none where it surrounds the axis. Its smallest z is ``m_z - sqrt(q Sigma_zz)``: since t on a pixel's ray is
+z, that is a lower bound of t for all rays. A list is sorted by m_z, which is nearly the order of each ray's hits.
 
 Bounds are slightly enlarged, so that rounding never excludes a ray that grazes the ellipsoid.
 """
@@ -40,7 +39,7 @@ class Ellipsoids(NamedTuple):
 
 
 class TileLists(NamedTuple):
-    """The primitives of each tile, by the lower bounds of their t; T tiles, M pairs of a tile and a primitive."""
+    """The primitives of each tile, by the depths of their centres; T tiles, M pairs of a tile and a primitive."""
 
     offsets: Ints
     """[T + 1] where the list of each tile begins, tile rows from the top."""
@@ -140,7 +139,7 @@ def pixel_range(low, high, focal, center, n):
 
 @kernel(parallel=False)
 def _bound_all(ellipsoids, frame, boxes, along, offsets, row_offsets):
-    """Write boxes, depths and lower bounds of t, the first pair of each tile, and the number of pairs of each primitive."""
+    """Write boxes, depths and lower bounds of t, and where the pairs of each tile and of each primitive begin."""
     (means, axes, reaches), (depths, nearest) = ellipsoids, along
     R, t, n_columns = frame.R, frame.t, (frame.width + TILE - 1) // TILE
     for n in range(len(means)):
