@@ -21,10 +21,8 @@ N_COLUMNS = 25
 
 
 def make_records(means: Floats, spans: Floats, radii: Floats, opacities: Floats, n_sides: int) -> Floats:
-    """Return the records [N, N_COLUMNS] of polygons of one number of sides; spans [N, 3, 2] are above 0."""
+    """Return the records [N, N_COLUMNS] of polygons of one number of sides, not finite without spans [N, 3, 2]."""
     S_a, S_b, n = spans[:, :, 0], spans[:, :, 1], n_sides
-    with np.errstate(over="ignore"):
-        squares = np.sum(spans**2, axis=1)  # [N, 2]
     records = np.empty((len(means), N_COLUMNS))
     records[:, OPACITY] = opacities
     records[:, N_SIDES] = n
@@ -33,9 +31,11 @@ def make_records(means: Floats, spans: Floats, radii: Floats, opacities: Floats,
     records[:, CENTRE:SPAN_A] = means
     records[:, SPAN_A:SPAN_B] = S_a
     records[:, SPAN_B:U] = S_b
-    records[:, U:V] = S_a / squares[:, :1]
-    records[:, V:NORMAL] = S_b / squares[:, 1:]
-    records[:, NORMAL:] = np.cross(S_a, S_b)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        squares = np.sum(spans**2, axis=1)  # [N, 2]
+        records[:, U:V] = S_a / squares[:, :1]
+        records[:, V:NORMAL] = S_b / squares[:, 1:]
+        records[:, NORMAL:] = np.cross(S_a, S_b)
     return records
 
 
