@@ -94,7 +94,10 @@ def list_tiles(ellipsoids: Ellipsoids, camera: Camera, conventions: Conventions)
     frame = _Frame(
         np.ascontiguousarray(seen.cam_from_world_R),
         np.ascontiguousarray(seen.cam_from_world_t),
-        *(float(number) for number in (seen.fx, seen.fy, seen.cx, seen.cy)),
+        float(seen.fx),
+        float(seen.fy),
+        float(seen.cx),
+        float(seen.cy),
         float(conventions.near_plane),
         float(conventions.far_plane),
         seen.width,
