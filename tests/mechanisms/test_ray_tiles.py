@@ -179,6 +179,21 @@ def test_opaque_layers_end_a_ray_where_they_should(conventions, rng):
     assert_agree(results)
 
 
+def test_a_later_entry_of_a_list_may_be_met_first():
+    """Three walls at z = 2, above the clamp, end the rays; a ball at 3 begins behind them; a needle with its centre at 4
+    leans towards the camera and is met at 1.
+    """
+    places = np.array([[0, 0, 2.0], [0, 0, 2.0], [0, 0, 2.0], [0, 0, 3.0], [2.0, 0, 4.0]])
+    scales = np.array([[3, 3, 0.1]] * 3 + [[0.02] * 3] + [[0.1, 0.1, 3.0]])
+    lean = np.arctan2(2, 3) / 2
+    quats = np.array([[1.0, 0, 0, 0]] * 4 + [[np.cos(lean), 0, np.sin(lean), 0]])
+    results = both_ways(whiten(places, quats, np.log(scales), np.array([0.995, 0.995, 0.995, 0.9, 0.9])))
+    hits, r = results[0][0], 10 * CAMERA.width + 14  # the pixel on the axis
+    assert hits.gaussian_ids[hits.offsets[r]] == 4 and hits.depths[hits.offsets[r]] == pytest.approx(1, abs=0.1)
+    assert (hits.unclamped > 0.99).any()
+    assert_agree(results)
+
+
 def test_a_ray_has_any_number_of_hits(rng):
     """A thousand faint layers, of which no ray is stopped: every ray has all of them, in the order of t."""
     n = 1000
