@@ -180,7 +180,7 @@ def test_opaque_layers_end_a_ray_where_they_should(conventions, rng):
 
 
 def test_a_later_entry_of_a_list_may_be_met_first():
-    """Three walls at z = 2, above the clamp, end the rays; a ball at 3 begins behind them; a needle with its centre at 4
+    """Three walls at z = 2, above the clamp, end the rays; a ball at 3 begins behind them; a needle, its centre at 4,
     leans towards the camera and is met at 1.
     """
     places = np.array([[0, 0, 2.0], [0, 0, 2.0], [0, 0, 2.0], [0, 0, 3.0], [2.0, 0, 4.0]])
