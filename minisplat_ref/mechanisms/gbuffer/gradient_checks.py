@@ -11,9 +11,9 @@ from minisplat_ref.mechanisms.gbuffer.brdf import SIZE
 from minisplat_ref.mechanisms.gbuffer.environment import locate
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import STAGE
-from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS
+from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, Filtered
 from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficients, has_own_colors
-from minisplat_ref.mechanisms.gbuffer.shading import ShadingTape
+from minisplat_ref.mechanisms.gbuffer.shading import Surface, mirror_rays
 from minisplat_ref.mechanisms.gbuffer.tone import KNEE
 from minisplat_ref.mechanisms.surfels import gradient_checks as of_surfels
 from minisplat_ref.oracle.models import Drawn, model_stage
@@ -26,22 +26,22 @@ from minisplat_ref.types import Floats, RenderOutput, Scene
 ROWS = 4  # of the environment: fewer kinks, and fewer derivatives, than training has
 
 
-def sides_of(tape: ShadingTape, linear: Floats) -> list[np.ndarray]:
+def sides_of(surface: Surface, light: Filtered, linear: Floats) -> list[np.ndarray]:
     """Return the texels that are read of every map, the cells of both tables, and the sides of all clamps.
 
     Parameters
     ----------
-    tape : ShadingTape
-        From :func:`minisplat_ref.mechanisms.gbuffer.shading.shade`.
+    surface, light
+        The arguments of :func:`minisplat_ref.mechanisms.gbuffer.shading.shade`.
     linear : ndarray of shape (P, 3)
         The colours that it returned, before the tone curve.
     """
-    sides = [locate(tape.r, *image.shape[:2]).texels for image in tape.light.maps]
-    rows = [tape.r @ (0, 0, 1.0) > np.cos(np.pi * (0.5 / len(image))) for image in tape.light.maps]  # beyond the first
-    rows += [tape.r @ (0, 0, -1.0) > np.cos(np.pi * (0.5 / len(image))) for image in tape.light.maps]
-    roughness = tape.surface.roughness
-    cells = [np.floor(x * (SIZE - 1)) for x in (tape.cosines, roughness)]
-    return [*sides, *rows, np.searchsorted(KNOTS, roughness), *cells, tape.cosines > 0, linear > KNEE]
+    cosines, r = mirror_rays(surface)
+    sides = [locate(r, *image.shape[:2]).texels for image in light.maps]
+    rows = [r @ (0, 0, 1.0) > np.cos(np.pi * (0.5 / len(image))) for image in light.maps]  # beyond the first
+    rows += [r @ (0, 0, -1.0) > np.cos(np.pi * (0.5 / len(image))) for image in light.maps]
+    cells = [np.floor(x * (SIZE - 1)) for x in (cosines, surface.roughness)]
+    return [*sides, *rows, np.searchsorted(KNOTS, surface.roughness), *cells, cosines > 0, linear > KNEE]
 
 
 def shading_stage(
@@ -79,11 +79,12 @@ def shading_stage(
 
     def sides(drawn: Drawn) -> list[np.ndarray]:
         tape = shaded(drawn.tape)
+        surface, light, *_ = tape.shading
         g, own = drawn.model.gaussians, list(further(drawn))
         if has_own_colors(g):
             own.append(light_around(tape.sight, coefficients(g, tape.rows)) > 0)
             own.append(tape.blend.shown.colors[:, :3] > 0)  # own colours
-        return [*of_surfels.sides_of(tape.blend.shown), *sides_of(tape.shading, tape.linear), *own]
+        return [*of_surfels.sides_of(tape.blend.shown), *sides_of(surface, light, tape.linear), *own]
 
     def shared(scene: Scene, rng: np.random.Generator) -> dict[str, Floats]:
         first = dict(representation.shared(scene, rng))

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.mechanisms.gbuffer import shading, shading_kernels
 from minisplat_ref.mechanisms.gbuffer.around import (
     Sight,
     light_around,
@@ -36,7 +37,7 @@ from minisplat_ref.mechanisms.gbuffer.population import (
     sigmoid,
 )
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter, prefilter_vjp
-from minisplat_ref.mechanisms.gbuffer.shading import Around, ShadingTape, Surface, shade, shade_vjp
+from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
@@ -44,6 +45,7 @@ from minisplat_ref.mechanisms.surfels import renderer as discs
 from minisplat_ref.mechanisms.surfels.projection import SurfelGradient, centers_moved
 from minisplat_ref.reference.pinhole import pose, with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, choose_degree, parameters_vjp
+from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
 
@@ -117,7 +119,7 @@ class ReflectiveTape(NamedTuple):
     rows: Ints  # [M] visible surfels
     sight: Sight
     sh_degree: int | Ints  # of own colours
-    shading: ShadingTape
+    shading: Any  # tape of ``shade``
     linear: Floats  # [M or P, 3] colours before the tone curve
     environment: Floats  # [H, 2 H, 3]
     pixels: _Pixels | None  # of shading per pixel
@@ -196,7 +198,7 @@ def render_reflective(
     slices = discs.channels(own.wants)
     if stage < PER_PIXEL:
         surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
-        linear, shading = shade(surface, light, mirrors=mirrors)
+        linear, shaded = choose_twin(request.backend).shade(surface, light, mirrors=mirrors)
         colors[rows] = tone(linear)
         output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
         image, pixels = output.image, None
@@ -220,7 +222,7 @@ def render_reflective(
             else:
                 sees = visibility.ravel()[pixels.rows]
             around = Around(sees, np.ascontiguousarray(X[:, 11:]))
-        linear, shading = shade(surface, light, around, mirrors, scattered)
+        linear, shaded = choose_twin(request.backend).shade(surface, light, around, mirrors, scattered)
         background = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
         image = output.image.copy()
         image[:, :, :3] = background
@@ -233,7 +235,7 @@ def render_reflective(
             wanted.append(image[:, :, first + at : first + at + size])
     output = output._replace(image=np.ascontiguousarray(np.concatenate(wanted, axis=2)))
     return output, ReflectiveTape(
-        model, seen, request, tape, rows, sight, sh_degree, shading, linear, environment, pixels, slices, materials
+        model, seen, request, tape, rows, sight, sh_degree, shaded, linear, environment, pixels, slices, materials
     )
 
 
@@ -256,7 +258,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         behind = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
         A, v_seen = p.alpha[:, None], v_rgb[p.rows]
         v_background = v_rgb.sum(axis=0) - np.sum(A * v_seen, axis=0)
-        v = shade_vjp(tape.shading, tone_vjp(tape.linear, A * v_seen))
+        v = choose_twin(request.backend).shade_vjp(tape.shading, tone_vjp(tape.linear, A * v_seen))
         v_X = np.zeros_like(p.blended)
         v_X[:, 6:9], v_X[:, 9], v_X[:, 10] = v.surface.albedo, v.surface.metallic, v.surface.roughness
         if v.scattered is not None:
@@ -293,7 +295,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
         v_background, v_carried = v_blend.background, np.zeros((len(g.means), N_MATERIAL), dtype)
         v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
-        v = shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
+        v = choose_twin(request.backend).shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
         v_carried[tape.rows, :3] += v.surface.albedo
         v_carried[tape.rows, 3] += v.surface.metallic
         v_carried[tape.rows, 4] += v.surface.roughness
@@ -344,6 +346,11 @@ def _parameters_vjp(
 
 def _surface(carried: Floats, normals: Floats, to_camera: Floats) -> Surface:
     return Surface(np.ascontiguousarray(carried[:, :3]), carried[:, 3], carried[:, 4], normals, to_camera)
+
+
+def choose_twin(backend: Backend) -> Any:
+    """Return the module that shades points on a backend: kernels, or the same in NumPy."""
+    return shading_kernels if backend.is_compiled else shading
 
 
 def has_own_colors(g: Any) -> bool:

@@ -76,6 +76,13 @@ class ShadingGradient(NamedTuple):
     scattered: Floats | None  # [P, 3]
 
 
+def mirror_rays(surface: Surface) -> tuple[Floats, Floats]:
+    """Return n.v [P] and the directions r [P, 3]."""
+    n, v = surface.normals, surface.to_camera
+    cosines = np.sum(n * v, axis=1)
+    return cosines, 2 * cosines[:, None] * n - v
+
+
 def shade(
     surface: Surface,
     light: Filtered,
@@ -98,9 +105,8 @@ def shade(
     scattered : ndarray of shape (P, 3), optional
         D, the light that the surface would scatter without metal; that of the environment by default.
     """
-    a, m, roughness, n, v = surface
-    cosines = np.sum(n * v, axis=1)
-    r = 2 * cosines[:, None] * n - v
+    a, m, roughness, n, _ = surface
+    cosines, r = mirror_rays(surface)
     shares = reflectance(cosines, roughness)
     if not mirrors:
         shares = (np.zeros_like(shares[0]),) * 3
