@@ -15,6 +15,7 @@ from minisplat_ref.mechanisms.gbuffer.brdf import hammersley, integrate, reflect
 from minisplat_ref.mechanisms.gbuffer.environment import locate, read, texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import read_environment, relight
 from minisplat_ref.mechanisms.gbuffer.maps import map_image
+from minisplat_ref.mechanisms.gbuffer.pixels import Blended, find_rows, points_of
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, matte, prefilter, prefilter_vjp, reflected
 from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface, shade, shade_vjp
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp, untone
@@ -328,21 +329,20 @@ def test_a_reflected_ray_begins_beyond_its_surface_and_does_not_end(distance, sh
     towards = np.array([[0.0, 0, -1]])
     surface = Surface(np.ones((1, 3)), np.ones(1), np.zeros(1), towards, towards)
     output = SimpleNamespace(image=np.array([[[0.0, 0, 0, 0.5 * 2]]]))  # the depth times the alpha
-    pixels = SimpleNamespace(rows=np.array([0]), alpha=np.array([0.5]))
+    points = SimpleNamespace(rows=np.array([0]), alpha=np.array([0.5]), surface=surface)
     seen = SimpleNamespace(camera=camera, primitives=disc)
-    found = renderer._visibility(surface, output, pixels, seen, Request(conventions=GSPLAT_MAIN, backend=backend))
+    found = renderer._visibility(points, output, seen, Request(conventions=GSPLAT_MAIN, backend=backend))
     assert_allclose(found, [share], atol=CLOSED_FORM)
 
 
 def test_pixels_without_a_surface_or_whose_normals_cancel_are_not_shaded():
     """Of three pixels the second has two normals that cancel, and the third alpha of less than half the least."""
-    image = np.zeros((1, 3, 7))
-    image[0, :, 6] = -0.5, 0.0, -1e-3
-    output = SimpleNamespace(image=image, alpha=np.array([[0.5, 0.5, 0.4 * GSPLAT_MAIN.alpha_min]]))
-    slices = {"rgb": slice(0, 3), "depth": slice(3, 4), "normal": slice(4, 7)}
-    camera = Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 1.5, 0.5, 3, 1)
-    found = renderer._pixels(output, slices, camera, Request(conventions=GSPLAT_MAIN))
-    assert found.rows.tolist() == [0] and found.lengths.tolist() == [[0.5]]
+    sums = np.zeros((1, 3, 12))
+    sums[0, :, 6] = -0.5, 0.0, -1e-3
+    blended = Blended(sums, np.array([[0.5, 0.5, 0.4 * GSPLAT_MAIN.alpha_min]]), normals=4, carried=7)
+    rows = find_rows(blended, GSPLAT_MAIN.alpha_min / 2)
+    assert rows.tolist() == [0]
+    assert points_of(blended, rows, Camera(np.eye(3), np.zeros(3), 10.0, 10.0, 1.5, 0.5, 3, 1)).lengths == [0.5]
 
 
 def test_the_first_row_of_the_table_is_of_a_grazing_view():

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.gbuffer import shading, shading_kernels
+from minisplat_ref.mechanisms.gbuffer import pixel_kernels, pixels, shading, shading_kernels
 from minisplat_ref.mechanisms.gbuffer.around import (
     Sight,
     light_around,
@@ -29,6 +29,7 @@ from minisplat_ref.mechanisms.gbuffer.around import (
     towards_vjp,
 )
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
+from minisplat_ref.mechanisms.gbuffer.pixels import N_MATERIAL, Blended, Points, find_rows
 from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
     STAGE,
@@ -37,7 +38,7 @@ from minisplat_ref.mechanisms.gbuffer.population import (
     sigmoid,
 )
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter, prefilter_vjp
-from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface
+from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface, mirror_rays
 from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
@@ -47,11 +48,10 @@ from minisplat_ref.reference.pinhole import pose, with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request, choose_degree, parameters_vjp
 from minisplat_ref.rendering.backends import Backend
 from minisplat_ref.training.sky import unit_rays
-from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, SHGradient, View
+from minisplat_ref.types import Floats, Ints, Model, RenderOutput, SHGradient, View
 
 MAPS = {"albedo": 3, "metallic": 1, "roughness": 1}
 """The material's channels, in the order in which surfels carry them."""
-N_MATERIAL = sum(MAPS.values())
 RAY_START = 0.02  # of the pixel's depth: where a reflected ray begins, so that it misses its own surface
 GUIDES = frozenset({"depth", "normal"})  # what shading per pixel needs
 
@@ -99,16 +99,6 @@ class Materials(NamedTuple):
     """Gradient of ``blend``, and that with respect to ``further``."""
 
 
-class _Pixels(NamedTuple):
-    """The pixels that show a surfel, and the blended values there."""
-
-    rows: Ints  # [P] y W + x
-    alpha: Floats  # [P] A
-    blended: Floats  # [P, 3 + 3 + 5 + K] sums: own colours, normals, materials, and the 0 or 3 of light from around
-    lengths: Floats  # [P, 1] of the summed normals
-    to_camera: Floats  # [P, 3] camera frame
-
-
 class ReflectiveTape(NamedTuple):
     """The values that :func:`render_reflective` keeps for :func:`render_reflective_vjp`."""
 
@@ -121,8 +111,9 @@ class ReflectiveTape(NamedTuple):
     sh_degree: int | Ints  # of own colours
     shading: Any  # tape of ``shade``
     linear: Floats  # [M or P, 3] colours before the tone curve
+    encoded: Floats  # [M or P, 3] and after it
     environment: Floats  # [H, 2 H, 3]
-    pixels: _Pixels | None  # of shading per pixel
+    points: Points | None  # of shading per pixel
     slices: dict[str, slice]  # of what is blended
     materials: Materials
 
@@ -196,12 +187,13 @@ def render_reflective(
     environment = np.exp(model.shared[ENVIRONMENT].astype(dtype))
     light, carried, colors = prefilter(environment), materials.carried(seen), np.zeros_like(g.means)
     slices = discs.channels(own.wants)
+    kernels = choose_twin(request.backend)
     if stage < PER_PIXEL:
         surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
-        linear, shaded = choose_twin(request.backend).shade(surface, light, mirrors=mirrors)
-        colors[rows] = tone(linear)
+        linear, shaded = kernels.shade(surface, light, mirrors=mirrors)
+        encoded = colors[rows] = tone(linear)
         output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
-        image, pixels = output.image, None
+        image, points, rgb = output.image, None, output.image[:, :, :3]
     else:
         further = np.zeros_like(g.means) if has_own_colors(g) else g.means[:, :0]
         if has_own_colors(g):
@@ -209,33 +201,31 @@ def render_reflective(
             colors = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, seen.camera, sh_degree, radii)
             further[rows] = light_around(sight, coefficients(g, rows))
         output, tape = materials.blend(seen, colors, carried, further, own._replace(background=None))
-        pixels = _pixels(output, slices, camera, request)
-        n_world = pixels.blended[:, 3:6] / pixels.lengths @ sight.R
-        X = pixels.blended / pixels.alpha[:, None]
-        surface = _surface(X[:, 6:11], n_world, pixels.to_camera @ sight.R)
-        around = scattered = None
-        if has_own_colors(g):
-            scattered = np.ascontiguousarray(X[:, :3])
+        image, blended = output.image, _name_channels(output.image, output.alpha, slices)
+        shown = find_rows(blended, request.conventions.alpha_min / 2)
+        points = choose_points(request.backend).points_of(blended, shown, camera)
+        around = None
         if stage >= WITH_OCCLUSION and has_own_colors(g):
             if visibility is None:
-                sees = _visibility(surface, output, pixels, seen, request)
+                sees = _visibility(points, output, seen, request)
             else:
-                sees = visibility.ravel()[pixels.rows]
-            around = Around(sees, np.ascontiguousarray(X[:, 11:]))
-        linear, shaded = choose_twin(request.backend).shade(surface, light, around, mirrors, scattered)
-        background = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
-        image = output.image.copy()
-        image[:, :, :3] = background
-        shown = pixels.alpha[:, None] * tone(linear) + (1 - pixels.alpha[:, None]) * background
-        image.reshape(-1, image.shape[2])[pixels.rows, :3] = shown
-    wanted = [image[:, :, slices[name]] for name in discs.channels(request.wants - maps)]
+                sees = visibility.ravel()[shown]
+            around = Around(sees, points.further)
+        scattered = points.own if has_own_colors(g) else None
+        linear, shaded = kernels.shade(points.surface, light, around, mirrors, scattered)
+        encoded, A = tone(linear), points.alpha[:, None]
+        behind = _background(request, dtype)
+        rgb = np.broadcast_to(behind, (*output.alpha.shape, 3)).copy()
+        rgb.reshape(-1, 3)[shown] = A * encoded + (1 - A) * behind
+    wanted = [image[:, :, slices[name]] for name in discs.channels(request.wants - maps) if name != "rgb"]
     first = max(part.stop for part in slices.values())
     for (name, size), at in zip(MAPS.items(), (0, 3, 4), strict=True):
         if name in maps:
             wanted.append(image[:, :, first + at : first + at + size])
-    output = output._replace(image=np.ascontiguousarray(np.concatenate(wanted, axis=2)))
+    output = output._replace(image=np.concatenate([rgb, *wanted], axis=2))
     return output, ReflectiveTape(
-        model, seen, request, tape, rows, sight, sh_degree, shaded, linear, environment, pixels, slices, materials
+        *(model, seen, request, tape, rows, sight, sh_degree, shaded, linear, encoded, environment, points, slices),
+        materials,
     )
 
 
@@ -252,35 +242,22 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
     v_sums = _v_blended(tape, v_image)
     R = tape.sight.R
     v_R, v_x, v_normals = np.zeros((3, 3)), np.zeros_like(tape.sight.x), np.zeros_like(tape.sight.normals)
-    if tape.pixels is not None:
-        p = tape.pixels
-        v_rgb = v_image.reshape(-1, v_image.shape[2])[:, :3]
-        behind = np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
-        A, v_seen = p.alpha[:, None], v_rgb[p.rows]
-        v_background = v_rgb.sum(axis=0) - np.sum(A * v_seen, axis=0)
-        v = choose_twin(request.backend).shade_vjp(tape.shading, tone_vjp(tape.linear, A * v_seen))
-        v_X = np.zeros_like(p.blended)
-        v_X[:, 6:9], v_X[:, 9], v_X[:, 10] = v.surface.albedo, v.surface.metallic, v.surface.roughness
-        if v.scattered is not None:
-            v_X[:, :3] = v.scattered
-        if v.around is not None:
-            v_X[:, 11:] = v.around
-        v_alpha.ravel()[p.rows] += np.sum(v_seen * (tone(tape.linear) - behind), axis=1)
-        v_alpha.ravel()[p.rows] -= np.sum(v_X * p.blended, axis=1) / p.alpha**2
-        n = p.blended[:, 3:6] / p.lengths
-        v_n = v.surface.normals @ R.T
-        v_X = v_X / A
-        v_X[:, 3:6] = (v_n - n * np.sum(n * v_n, axis=1, keepdims=True)) / p.lengths
-        v_R += n.T @ v.surface.normals + p.to_camera.T @ v.surface.to_camera
-        flat, first = v_sums.reshape(-1, v_sums.shape[2]), max(part.stop for part in tape.slices.values())
-        flat[:, :3] = 0
-        flat[p.rows, :3] = v_X[:, :3]
-        flat[p.rows, tape.slices["normal"]] += v_X[:, 3:6]
-        flat[p.rows, first:] += v_X[:, 6:]
+    kernels = choose_twin(request.backend)
+    if tape.points is not None:
+        p, rgb = tape.points, v_image[:, :, :3].reshape(-1, 3)
+        A, v_seen = p.alpha[:, None], rgb[p.rows]
+        v_shown = A * v_seen
+        v_background = rgb.sum(axis=0) - v_shown.sum(axis=0)
+        v = kernels.shade_vjp(tape.shading, tone_vjp(tape.linear, v_shown))
+        v_alpha.reshape(-1)[p.rows] += np.sum(v_seen * (tape.encoded - _background(request, dtype)), axis=1)
+        v_sums[:, :, :3] = 0
+        camera = with_principal_point(tape.seen.camera, request.conventions)
+        choose_points(request.backend).points_vjp(p, camera, v, _name_channels(v_sums, v_alpha, tape.slices))
+        v_R += R @ (p.surface.normals.T @ v.surface.normals + p.surface.to_camera.T @ v.surface.to_camera)
     zero = np.zeros((3, 3), dtype)
     v_sh = SHGradient(np.zeros_like(g.means), np.zeros_like(g.sh_dc), np.zeros_like(g.sh_rest), zero, zero[0])
     v_fields: dict[str, Floats] = {}
-    if tape.pixels is not None:
+    if tape.points is not None:
         v_blend, v_further = tape.materials.blend_vjp(tape.blend, v_sums, v_alpha)
         v_carried = v_blend.carried
         if has_own_colors(g):
@@ -295,7 +272,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
         v_background, v_carried = v_blend.background, np.zeros((len(g.means), N_MATERIAL), dtype)
         v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
-        v = choose_twin(request.backend).shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
+        v = kernels.shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
         v_carried[tape.rows, :3] += v.surface.albedo
         v_carried[tape.rows, 3] += v.surface.metallic
         v_carried[tape.rows, 4] += v.surface.roughness
@@ -353,6 +330,11 @@ def choose_twin(backend: Backend) -> Any:
     return shading_kernels if backend.is_compiled else shading
 
 
+def choose_points(backend: Backend) -> Any:
+    """Return the module that makes points of pixels on a backend."""
+    return pixel_kernels if backend.is_compiled else pixels
+
+
 def has_own_colors(g: Any) -> bool:
     """Return whether surfels have own colours, and light from around, for shading per pixel."""
     return "around_dc" in g._fields
@@ -371,28 +353,25 @@ def _coefficients_vjp(g: ReflectiveSurfels, rows: Ints, v_coefficients: Floats) 
     return {"around_dc": v_dc, "around_rest": v_rest}
 
 
-def _pixels(output: RenderOutput, slices: dict[str, slice], camera: Camera, request: Request) -> _Pixels:
-    """Return the pixels that show a surfel whose normals do not cancel."""
-    flat = output.image.reshape(-1, output.image.shape[2])
-    normals, alpha = flat[:, slices["normal"]], output.alpha.ravel()
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    rows = np.flatnonzero((alpha > request.conventions.alpha_min / 2) & (lengths[:, 0] > 0))
-    first = max(part.stop for part in slices.values())
-    blended = np.column_stack([flat[rows, :3], normals[rows], flat[rows, first:]])
-    return _Pixels(rows, alpha[rows], blended, lengths[rows], -unit_rays(camera, rows, flat.dtype))
+def _name_channels(sums: Floats, alpha: Floats, slices: dict[str, slice]) -> Blended:
+    return Blended(sums, alpha, slices["normal"].start, max(part.stop for part in slices.values()))
 
 
-def _visibility(surface: Surface, output: RenderOutput, pixels: _Pixels, seen: discs.Seen, request: Request) -> Floats:
+def _background(request: Request, dtype: np.dtype) -> Floats:
+    """Return the colour [3] behind all surfels."""
+    return np.zeros(3, dtype) if request.background is None else request.background.astype(dtype)
+
+
+def _visibility(points: Points, output: RenderOutput, seen: discs.Seen, request: Request) -> Floats:
     """Return the fraction of the environment that the reflected ray of each pixel sees."""
-    depth = output.image.reshape(-1, output.image.shape[2])[pixels.rows, 3] / pixels.alpha
+    depth = output.image.reshape(-1, output.image.shape[2])[points.rows, 3] / points.alpha
     camera = with_principal_point(seen.camera, request.conventions)
     R, t = pose(camera, np.dtype(np.float64))
-    ray = unit_rays(camera, pixels.rows, np.dtype(np.float64))
-    points = (ray / ray[:, 2:] * depth[:, None] - t) @ R
-    n, v = surface.normals.astype(np.float64), surface.to_camera.astype(np.float64)
-    r = 2 * np.sum(n * v, axis=1, keepdims=True) * n - v
+    ray = unit_rays(camera, points.rows, np.dtype(np.float64))
+    origins = (ray / ray[:, 2:] * depth[:, None] - t) @ R
+    _, r = mirror_rays(Surface(*(field.astype(np.float64) for field in points.surface)))
     near = RAY_START * depth
-    rays = Rays(points, r, near, np.full_like(near, np.inf))
+    rays = Rays(origins, r, near, np.full_like(near, np.inf))
     return transmittances(seen.primitives, rays, request.conventions, request.backend).astype(output.image.dtype)
 
 
@@ -400,9 +379,9 @@ def _v_blended(tape: ReflectiveTape, v_image: Floats) -> Floats:
     """Return the derivative with respect to the blended values from that of the requested channels."""
     blended, maps = tape.slices, tape.request.wants & MAPS.keys()
     first = max(part.stop for part in blended.values())
-    n_carried = N_MATERIAL if tape.pixels is not None or maps else 0
-    if tape.pixels is not None:
-        n_carried = tape.pixels.blended.shape[1] - 6
+    n_carried = N_MATERIAL if tape.points is not None or maps else 0
+    if tape.points is not None:
+        n_carried += tape.points.further.shape[1]
     v = np.zeros((*v_image.shape[:2], first + n_carried), v_image.dtype)
     for name, part in channels(tape.request.wants).items():
         if name in MAPS:
