@@ -10,8 +10,10 @@
 ``visibility``   how much of the surfels' own opacity lies in the way of a reflected ray
 ``population``   surfels with a material, and what they have in common
 ``around``       the light that a surfel receives from the scene around it
+``pixels``       from what a pixel blends to the surface point that it shows
 ``renderer``     shading surfel by surfel, or pixel by pixel
 ``training``     the stages of Ref-Gaussian's training
 
-Each function that training differentiates is followed by its gradient.
+Each function that training differentiates is followed by its gradient. ``shading_kernels``, ``pixel_kernels`` and
+``around_kernels`` have the functions of the modules that they are named after as loops, around ``formulas``.
 """

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Floats, Ints
 
 
 class Sight(NamedTuple):
@@ -31,10 +31,32 @@ class Sight(NamedTuple):
     """[3, 3] cam_from_world."""
 
 
+class Coefficients(NamedTuple):
+    """The coefficients of a population's N surfels, of which M are seen."""
+
+    dc: Floats
+    """[N, 3] c_0."""
+    rest: Floats
+    """[N, 3 (K - 1)] the others, the three channels of each side by side."""
+    rows: Ints
+    """[M] those that are seen."""
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics."""
+        return math.isqrt(1 + self.rest.shape[1] // 3) - 1
+
+    def join(self) -> Floats:
+        """Return c_k of the surfels that are seen, [M, K, 3]."""
+        rest = self.rest[self.rows].reshape(len(self.rows), self.rest.shape[1] // 3, 3)
+        return np.concatenate([self.dc[self.rows, None], rest], axis=1)
+
+
 class AroundGradient(NamedTuple):
     """Gradient of the loss with respect to the inputs of :func:`light_around`."""
 
-    coefficients: Floats  # [M, K, 3]
+    dc: Floats  # [N, 3]
+    rest: Floats  # [N, 3 (K - 1)]
     x: Floats  # [M, 3]
     normals: Floats  # [M, 3]
     R: Floats  # [3, 3]
@@ -47,19 +69,14 @@ def sight_of(means: Floats, normals: Floats, pose: tuple[Floats, Floats]) -> Sig
     return Sight(x, x / np.linalg.norm(x, axis=1, keepdims=True), normals, R)
 
 
-def light_around(sight: Sight, coefficients: Floats) -> Floats:
-    """Return the light [M, 3] that surfels of ``coefficients`` [M, K, 3] receive from around, linear RGB."""
-    basis = sh_basis(_reflected(sight) @ sight.R, degree_of(coefficients))
-    return np.maximum(0, np.einsum("mk,mkc->mc", basis, coefficients))
+def light_around(sight: Sight, coefficients: Coefficients) -> Floats:
+    """Return the light [M, 3] that surfels receive from around, linear RGB."""
+    basis = sh_basis(_reflected(sight) @ sight.R, coefficients.degree)
+    return np.maximum(0, np.einsum("mk,mkc->mc", basis, coefficients.join()))
 
 
-def degree_of(coefficients: Floats) -> int:
-    """Return the degree of harmonics of ``coefficients`` [M, K, 3]."""
-    return math.isqrt(coefficients.shape[1]) - 1
-
-
-def light_around_vjp(sight: Sight, coefficients: Floats, v_light: Floats) -> AroundGradient:
-    """Gradient of :func:`light_around`.
+def light_around_vjp(sight: Sight, coefficients: Coefficients, v_light: Floats) -> AroundGradient:
+    """Gradient of :func:`light_around`; that with respect to the coefficients of surfels that are not seen is 0.
 
     ::
 
@@ -67,20 +84,21 @@ def light_around_vjp(sight: Sight, coefficients: Floats, v_light: Floats) -> Aro
         v_r   = R v_w,   v_R = sum r v_w^T
         v_n   = -2 ((d.n) v_r + (n.v_r) d),   v_d = v_r - 2 (n.v_r) n,   v_x = (v_d - d (d.v_d)) / |x|
     """
-    r, (x, d, n, R) = _reflected(sight), sight
+    r, (x, d, n, R), c = _reflected(sight), sight, coefficients.join()
     w = r @ R
-    degree = degree_of(coefficients)
-    basis = sh_basis(w, degree)
-    v = np.where(np.einsum("mk,mkc->mc", basis, coefficients) >= 0, v_light, 0)
-    v_w = np.einsum("mk,mki->mi", np.einsum("mkc,mc->mk", coefficients, v), sh_basis_jacobian(w, degree))
+    basis = sh_basis(w, coefficients.degree)
+    v = np.where(np.einsum("mk,mkc->mc", basis, c) >= 0, v_light, 0)
+    v_w = np.einsum("mk,mki->mi", np.einsum("mkc,mc->mk", c, v), sh_basis_jacobian(w, coefficients.degree))
     v_r = v_w @ R.T
     d_n, n_v = np.sum(d * n, axis=1, keepdims=True), np.sum(n * v_r, axis=1, keepdims=True)
-    return AroundGradient(
-        coefficients=basis[:, :, None] * v[:, None, :],
-        x=towards_vjp(x, d, v_r - 2 * n_v * n),
-        normals=-2 * (d_n * v_r + n_v * d),
-        R=r.T @ v_w,
+    v_c, v_dc, v_rest = (
+        basis[:, :, None] * v[:, None, :],
+        np.zeros_like(coefficients.dc),
+        np.zeros_like(coefficients.rest),
     )
+    rows = coefficients.rows
+    v_dc[rows], v_rest[rows] = v_c[:, 0], v_c[:, 1:].reshape(len(rows), v_rest.shape[1])
+    return AroundGradient(v_dc, v_rest, towards_vjp(x, d, v_r - 2 * n_v * n), -2 * (d_n * v_r + n_v * d), r.T @ v_w)
 
 
 def towards_vjp(x: Floats, d: Floats, v_d: Floats) -> Floats:

@@ -39,6 +39,26 @@ def store_triple(table, row, a):
 
 
 @scalar
+def turn(R, a):
+    """Return R a."""
+    return (
+        R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
+        R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
+        R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@scalar
+def turn_back(R, a):
+    """Return R^T a."""
+    return (
+        R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
+        R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
+        R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@scalar
 def mirror(n, v):
     """Return n.v and ``r = 2 (n.v) n - v``."""
     cosine = dot(n, v)

@@ -10,7 +10,7 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import contiguous
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.mechanisms.gbuffer.formulas import dot, load_triple, store_triple
+from minisplat_ref.mechanisms.gbuffer.formulas import dot, load_triple, store_triple, turn, turn_back
 from minisplat_ref.mechanisms.gbuffer.pixels import N_MATERIAL, Blended, Points
 from minisplat_ref.mechanisms.gbuffer.shading import ShadingGradient, Surface
 from minisplat_ref.reference.pinhole import pinhole_rays
@@ -50,16 +50,6 @@ class _Fields(NamedTuple):
 
 
 @scalar
-def _turn_back(R, a):
-    """Return R^T a."""
-    return (
-        R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
-        R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
-        R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
-    )
-
-
-@scalar
 def _towards_camera(row, frame):
     """Return -u of a pixel, camera frame."""
     width = frame.slopes_x.size
@@ -74,8 +64,8 @@ def _fill_point(i, sums, frame, pixels, points):
     N = float(sums[row, frame.normals]), float(sums[row, frame.normals + 1]), float(sums[row, frame.normals + 2])
     length = math.sqrt(dot(N, N))
     pixels.lengths[i] = length
-    store_triple(points.normals, i, _turn_back(frame.R, (N[0] / length, N[1] / length, N[2] / length)))
-    store_triple(points.to_camera, i, _turn_back(frame.R, _towards_camera(row, frame)))
+    store_triple(points.normals, i, turn_back(frame.R, (N[0] / length, N[1] / length, N[2] / length)))
+    store_triple(points.to_camera, i, turn_back(frame.R, _towards_camera(row, frame)))
     for c in range(3):
         points.own[i, c] = per_alpha * sums[row, c]
         points.albedo[i, c] = per_alpha * sums[row, first + c]
@@ -93,9 +83,9 @@ def _chain_point(i, pixels, points, v, frame, v_sums):
     a = v_n[0] - along * n[0], v_n[1] - along * n[1], v_n[2] - along * n[2]
     total = dot(load_triple(v.albedo, i), load_triple(points.albedo, i))
     total += float(v.metallic[i]) * points.metallic[i] + float(v.roughness[i]) * points.roughness[i]
+    v_N = turn(frame.R, (per_length * a[0], per_length * a[1], per_length * a[2]))
     for c in range(3):
-        v_N = frame.R[c, 0] * a[0] + frame.R[c, 1] * a[1] + frame.R[c, 2] * a[2]
-        v_sums[row, frame.normals + c] += per_length * v_N
+        v_sums[row, frame.normals + c] += v_N[c]
         v_sums[row, first + c] += per_alpha * v.albedo[i, c]
     v_sums[row, first + 3] += per_alpha * v.metallic[i]
     v_sums[row, first + 4] += per_alpha * v.roughness[i]

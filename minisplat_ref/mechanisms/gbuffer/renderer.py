@@ -20,11 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.gbuffer import pixel_kernels, pixels, shading, shading_kernels
+from minisplat_ref.mechanisms.gbuffer import around, around_kernels, pixel_kernels, pixels, shading, shading_kernels
 from minisplat_ref.mechanisms.gbuffer.around import (
+    Coefficients,
     Sight,
-    light_around,
-    light_around_vjp,
     sight_of,
     towards_vjp,
 )
@@ -97,6 +96,23 @@ class Materials(NamedTuple):
     """``blend(seen, colors, carried, further, request)``: the channels of ``further`` [N, K] follow the materials."""
     blend_vjp: Callable[..., tuple[discs.BlendedGradient, Floats]] = blend_flat_vjp
     """Gradient of ``blend``, and that with respect to ``further``."""
+
+
+class Twins(NamedTuple):
+    """The modules that compute something in NumPy or by kernels, with the same functions."""
+
+    shading: Any
+    pixels: Any
+    around: Any
+
+
+IN_NUMPY = Twins(shading, pixels, around)
+COMPILED = Twins(shading_kernels, pixel_kernels, around_kernels)
+
+
+def choose_twins(backend: Backend) -> Twins:
+    """Return the modules of a backend."""
+    return COMPILED if backend.is_compiled else IN_NUMPY
 
 
 class ReflectiveTape(NamedTuple):
@@ -187,10 +203,10 @@ def render_reflective(
     environment = np.exp(model.shared[ENVIRONMENT].astype(dtype))
     light, carried, colors = prefilter(environment), materials.carried(seen), np.zeros_like(g.means)
     slices = discs.channels(own.wants)
-    kernels = choose_twin(request.backend)
+    twins = choose_twins(request.backend)
     if stage < PER_PIXEL:
         surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
-        linear, shaded = kernels.shade(surface, light, mirrors=mirrors)
+        linear, shaded = twins.shading.shade(surface, light, mirrors=mirrors)
         encoded = colors[rows] = tone(linear)
         output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
         image, points, rgb = output.image, None, output.image[:, :, :3]
@@ -199,20 +215,20 @@ def render_reflective(
         if has_own_colors(g):
             radii = seen.surfels.radii
             colors = request.backend.sh_colors(g.means, g.sh_dc, g.sh_rest, seen.camera, sh_degree, radii)
-            further[rows] = light_around(sight, coefficients(g, rows))
+            further[rows] = twins.around.light_around(sight, coefficients(g, rows))
         output, tape = materials.blend(seen, colors, carried, further, own._replace(background=None))
         image, blended = output.image, _name_channels(output.image, output.alpha, slices)
         shown = find_rows(blended, request.conventions.alpha_min / 2)
-        points = choose_points(request.backend).points_of(blended, shown, camera)
-        around = None
+        points = twins.pixels.points_of(blended, shown, camera)
+        hidden = None
         if stage >= WITH_OCCLUSION and has_own_colors(g):
             if visibility is None:
                 sees = _visibility(points, output, seen, request)
             else:
                 sees = visibility.ravel()[shown]
-            around = Around(sees, points.further)
+            hidden = Around(sees, points.further)
         scattered = points.own if has_own_colors(g) else None
-        linear, shaded = kernels.shade(points.surface, light, around, mirrors, scattered)
+        linear, shaded = twins.shading.shade(points.surface, light, hidden, mirrors, scattered)
         encoded, A = tone(linear), points.alpha[:, None]
         behind = _background(request, dtype)
         rgb = np.broadcast_to(behind, (*output.alpha.shape, 3)).copy()
@@ -242,17 +258,17 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
     v_sums = _v_blended(tape, v_image)
     R = tape.sight.R
     v_R, v_x, v_normals = np.zeros((3, 3)), np.zeros_like(tape.sight.x), np.zeros_like(tape.sight.normals)
-    kernels = choose_twin(request.backend)
+    twins = choose_twins(request.backend)
     if tape.points is not None:
         p, rgb = tape.points, v_image[:, :, :3].reshape(-1, 3)
         A, v_seen = p.alpha[:, None], rgb[p.rows]
         v_shown = A * v_seen
         v_background = rgb.sum(axis=0) - v_shown.sum(axis=0)
-        v = kernels.shade_vjp(tape.shading, tone_vjp(tape.linear, v_shown))
+        v = twins.shading.shade_vjp(tape.shading, tone_vjp(tape.linear, v_shown))
         v_alpha.reshape(-1)[p.rows] += np.sum(v_seen * (tape.encoded - _background(request, dtype)), axis=1)
         v_sums[:, :, :3] = 0
         camera = with_principal_point(tape.seen.camera, request.conventions)
-        choose_points(request.backend).points_vjp(p, camera, v, _name_channels(v_sums, v_alpha, tape.slices))
+        twins.pixels.points_vjp(p, camera, v, _name_channels(v_sums, v_alpha, tape.slices))
         v_R += R @ (p.surface.normals.T @ v.surface.normals + p.surface.to_camera.T @ v.surface.to_camera)
     zero = np.zeros((3, 3), dtype)
     v_sh = SHGradient(np.zeros_like(g.means), np.zeros_like(g.sh_dc), np.zeros_like(g.sh_rest), zero, zero[0])
@@ -265,14 +281,14 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
             v_sh = request.backend.sh_colors_vjp(
                 g.means, g.sh_dc, g.sh_rest, tape.seen.camera, tape.sh_degree, radii, v_blend.colors
             )
-            v_around = light_around_vjp(tape.sight, coefficients(g, tape.rows), v_further[tape.rows])
-            v_fields = _coefficients_vjp(g, tape.rows, v_around.coefficients)
+            v_around = twins.around.light_around_vjp(tape.sight, coefficients(g, tape.rows), v_further[tape.rows])
+            v_fields = {"around_dc": v_around.dc, "around_rest": v_around.rest}
             v_x, v_normals, v_R = v_around.x, v_around.normals, v_R + v_around.R
     else:
         v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
         v_background, v_carried = v_blend.background, np.zeros((len(g.means), N_MATERIAL), dtype)
         v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
-        v = kernels.shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
+        v = twins.shading.shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
         v_carried[tape.rows, :3] += v.surface.albedo
         v_carried[tape.rows, 3] += v.surface.metallic
         v_carried[tape.rows, 4] += v.surface.roughness
@@ -325,32 +341,14 @@ def _surface(carried: Floats, normals: Floats, to_camera: Floats) -> Surface:
     return Surface(np.ascontiguousarray(carried[:, :3]), carried[:, 3], carried[:, 4], normals, to_camera)
 
 
-def choose_twin(backend: Backend) -> Any:
-    """Return the module that shades points on a backend: kernels, or the same in NumPy."""
-    return shading_kernels if backend.is_compiled else shading
-
-
-def choose_points(backend: Backend) -> Any:
-    """Return the module that makes points of pixels on a backend."""
-    return pixel_kernels if backend.is_compiled else pixels
-
-
 def has_own_colors(g: Any) -> bool:
     """Return whether surfels have own colours, and light from around, for shading per pixel."""
     return "around_dc" in g._fields
 
 
-def coefficients(g: ReflectiveSurfels, rows: Ints) -> Floats:
-    """Return the coefficients [M, K, 3] of the light from around."""
-    rest = g.around_rest[rows].reshape(len(rows), g.around_rest.shape[1] // 3, 3)
-    return np.concatenate([g.around_dc[rows, None], rest], axis=1)
-
-
-def _coefficients_vjp(g: ReflectiveSurfels, rows: Ints, v_coefficients: Floats) -> dict[str, Floats]:
-    """Gradient of :func:`coefficients`, by field."""
-    v_dc, v_rest = np.zeros_like(g.around_dc), np.zeros_like(g.around_rest)
-    v_dc[rows], v_rest[rows] = v_coefficients[:, 0], v_coefficients[:, 1:].reshape(len(rows), v_rest.shape[1])
-    return {"around_dc": v_dc, "around_rest": v_rest}
+def coefficients(g: ReflectiveSurfels, rows: Ints) -> Coefficients:
+    """Return the coefficients of the light from around of surfels ``rows`` [M]."""
+    return Coefficients(g.around_dc, g.around_rest, rows)
 
 
 def _name_channels(sums: Floats, alpha: Floats, slices: dict[str, slice]) -> Blended:
