@@ -259,13 +259,12 @@ def blend(
         flat = seen._replace(surfels=seen.surfels._replace(normals=texels[:, 0, :3]))
         output, tape = shaded.blend_flat(flat, colors, texels[:, 0, 3:], further, request)
         return output, TextureTape(tape, texels, np.zeros((0, 0, N_CHANNELS)))
-    # As many channels as without textures, so that the same kernel blends the others.
-    output, tape = shaded.blend_flat(seen, colors, np.zeros_like(texels[:, 0, 3:]), further, request)
+    output, tape = discs.blend(seen, colors, further, request._replace(wants=request.wants - {"normal"}))
     image = choose_twin(request.backend).blend_texels(tape.shown.surfels, texels, tape.shown.bins, request.conventions)
-    mixed = output.image.copy()
-    for part, values in zip(_parts(tape), (image[:, :, :3], image[:, :, 3:]), strict=True):
-        mixed[:, :, part] = values
-    return output._replace(image=mixed), TextureTape(tape, texels, image)
+    parts = {**{name: output.image[:, :, part] for name, part in tape.slices.items()}, "normal": image[:, :, :3]}
+    n_own = max(part.stop for part in tape.slices.values())
+    mixed = [*(parts[name] for name in discs.channels(request.wants)), image[:, :, 3:], output.image[:, :, n_own:]]
+    return output._replace(image=np.concatenate(mixed, axis=2)), TextureTape(tape, texels, image)
 
 
 def blend_vjp(tape: TextureTape, v_image: Floats, v_alpha: Floats | None) -> tuple[discs.BlendedGradient, Floats]:
@@ -275,21 +274,22 @@ def blend_vjp(tape: TextureTape, v_image: Floats, v_alpha: Floats | None) -> tup
         v_texels = np.column_stack([v.surfels.normals, v.carried])[:, None]
         flat = v.surfels._replace(normals=np.zeros_like(v.surfels.normals))
         return v._replace(surfels=flat, carried=v_texels), v_further
-    shown, parts, others = tape.shown, _parts(tape.discs), v_image.copy()
-    for part in parts:
-        others[:, :, part] = 0
-    v, v_further = shaded.blend_flat_vjp(tape.discs, others, v_alpha)
+    shown, slices = tape.shown, discs.channels(frozenset(tape.discs.slices) | {"normal"})
+    first = max(part.stop for part in slices.values())
+    last = first + N_CHANNELS - 3
+    others = [v_image[:, :, slices[name]] for name in tape.discs.slices]
+    v = discs.blend_vjp(tape.discs, np.concatenate([*others, v_image[:, :, last:]], axis=2), v_alpha)
     v_T, v_c, v_o, v_texels = choose_twin(shown.backend).blend_texels_vjp(
         shown.surfels,
         tape.texels,
         shown.bins,
         shown.conventions,
         tape.image,
-        np.concatenate([v_image[:, :, part] for part in parts], axis=2),
+        np.concatenate([v_image[:, :, slices["normal"]], v_image[:, :, first:last]], axis=2),
     )
     s = v.surfels
     moved = s._replace(transforms=s.transforms + v_T, means2d=s.means2d + v_c, opacities=s.opacities + v_o)
-    return v._replace(surfels=moved, carried=v_texels), v_further
+    return v._replace(surfels=moved, carried=v_texels), v.carried
 
 
 def materials_on(backend: Backend, size: int) -> shaded.Materials:
@@ -331,12 +331,6 @@ def _split_texels(field: Floats, n_channels: int) -> Floats:
 def choose_twin(backend: Backend) -> Any:
     """Return the module that blends textures on a backend: kernels, or the same in NumPy."""
     return kernels if backend.is_compiled else textures
-
-
-def _parts(tape: discs.BlendTape) -> tuple[slice, slice]:
-    """Return the channels of normals and of materials among those that surfels blend."""
-    first = max(part.stop for part in tape.slices.values())
-    return tape.slices["normal"], slice(first, first + N_CHANNELS - 3)
 
 
 TEXTURED = Renderer("textured surfels", render_textured, shaded.render_reflective_vjp, shaded.channels)
