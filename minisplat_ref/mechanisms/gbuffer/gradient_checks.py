@@ -88,7 +88,8 @@ def shading_stage(
 
     def shared(scene: Scene, rng: np.random.Generator) -> dict[str, Floats]:
         first = dict(representation.shared(scene, rng))
-        return {**first, ENVIRONMENT: np.zeros((ROWS, 2 * ROWS, 3)), STAGE: np.full(1, float(stage))}
+        light = rng.normal(size=(ROWS, 2 * ROWS, 3))  # of contrast: without it, roughness would hardly matter
+        return {**first, ENVIRONMENT: light, STAGE: np.full(1, float(stage))}
 
     renderer = representation.renderer._replace(render=partial(render, visibility=visibility))
     held = representation._replace(renderer=renderer, shared=shared)
