@@ -17,11 +17,11 @@ import numpy as np
 
 from data_tools.claims import kit
 from minisplat_ref.app.runs.opened_run import Run, open_run
-from minisplat_ref.datasets.synthetic.materials import decode_srgb
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
 from minisplat_ref.io import read_image
+from minisplat_ref.io.srgb import decode_srgb
 from minisplat_ref.mechanisms.depth_maps.normals import central_normals
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Bools, Floats

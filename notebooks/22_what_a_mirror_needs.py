@@ -35,11 +35,11 @@ from data_tools.claims import reflective as study
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.extensions.discretized_sdf.model import HALF, opacity_logits
 from minisplat_ref.extensions.texture_splat.textures import REACH, find_corners, tangent_normals
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.mechanisms.gbuffer.population import PER_PIXEL, PER_SURFEL, WITH_OCCLUSION
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, prefilter
 from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
-from minisplat_ref.mechanisms.gbuffer.tone import tone
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Gaussians, Model, view_from
@@ -49,9 +49,9 @@ environment = study.environment()
 light = prefilter(environment)
 chosen = [0, len(light.maps) // 2, len(light.maps) - 1]
 figure, axes = plt.subplots(1, 4, figsize=(10.5, 1.8))
-show(axes[0], tone(environment), "environment")
+show(axes[0], encode_srgb(environment), "environment")
 for axis, k in zip(axes[1:], chosen, strict=True):
-    show(axis, tone(light.maps[k]), f"map {k} of {len(light.maps)}")
+    show(axis, encode_srgb(light.maps[k]), f"map {k} of {len(light.maps)}")
 _ = figure
 
 # %% [markdown]
@@ -72,7 +72,7 @@ for axis, roughness in zip(axes, (0.1, 0.4, 0.8), strict=True):
     to_camera = -away / np.linalg.norm(away, axis=1, keepdims=True)
     metal = Surface(np.full((n, 3), study.ALBEDO), np.ones(n), np.full(n, roughness), view.normals, to_camera)
     image = np.ones((*view.is_sphere.shape, 3))
-    image[view.is_sphere] = tone(shade(metal, light)[0])
+    image[view.is_sphere] = encode_srgb(shade(metal, light)[0])
     rough[roughness] = image
     show(axis, image, f"roughness {roughness}")
 _ = figure
@@ -180,7 +180,7 @@ flat = read.reshape(-1, 3)
 upright = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
 bumps = Surface(np.full((len(flat), 3), 0.9), np.ones(len(flat)), np.full(len(flat), 0.1), flat, upright)
 plain = bumps._replace(normals=upright)
-shaded = {name: tone(shade(s, light)[0]).reshape(96, 96, 3) for name, s in (("T = 1", plain), ("T = 4", bumps))}
+shaded = {name: encode_srgb(shade(s, light)[0]).reshape(96, 96, 3) for name, s in (("T = 1", plain), ("T = 4", bumps))}
 figure, axes = plt.subplots(1, 3, figsize=(8, 2.5))
 show(axes[0], 0.5 + 0.5 * read, "normals")
 for axis, (name, image) in zip(axes[1:], shaded.items(), strict=True):

@@ -32,11 +32,11 @@ from minisplat_ref.extensions.discretized_sdf.model import (
 )
 from minisplat_ref.extensions.discretized_sdf.recipe import projection
 from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.io.srgb import decode_srgb, encode_srgb
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
-from minisplat_ref.mechanisms.gbuffer.tone import tone, untone
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import pinhole_rays
@@ -256,7 +256,7 @@ def photograph(truth: Truth, light: Filtered) -> Floats:
     n = len(truth.normals)
     surface = Surface(albedo_at(truth.normals), np.zeros(n), np.full(n, ROUGHNESS), truth.normals, truth.to_camera)
     image = np.zeros((*truth.is_sphere.shape, 3))
-    image[truth.is_sphere] = tone(shade(surface, light)[0])
+    image[truth.is_sphere] = encode_srgb(shade(surface, light)[0])
     return image
 
 
@@ -286,13 +286,14 @@ def compare(model: Model, render: Any, truths: list[Truth]) -> tuple[dict[str, f
         found["plain"].append(output.image[truth.is_sphere][:, :3])
         image = render(relit, view_from(truth.camera), Request())[0].image
         first = image if k == 0 else first
-        found["relit"].append(untone(np.clip(image[truth.is_sphere], 0, 1)))
+        found["relit"].append(decode_srgb(np.clip(image[truth.is_sphere], 0, 1)))
         exact["albedo"].append(albedo_at(truth.normals))
         for name, which in (("plain", 0), ("relit", 1)):
             exact[name].append(np.clip(photograph(truth, _light(which))[truth.is_sphere], 0, 1))
     all_found, all_exact = ({key: np.concatenate(parts) for key, parts in d.items()} for d in (found, exact))
     albedo = _scaled(all_found["albedo"], all_exact["albedo"]) - all_exact["albedo"]
-    light = tone(np.maximum(_scaled(all_found["relit"], untone(all_exact["relit"])), 0)) - all_exact["relit"]
+    linear = np.maximum(_scaled(all_found["relit"], decode_srgb(all_exact["relit"])), 0)
+    light = encode_srgb(linear) - all_exact["relit"]
     plain = np.clip(all_found["plain"], 0, 1) - all_exact["plain"]
     return {
         "albedo_error": float(np.sqrt(np.mean(albedo**2))),

@@ -18,6 +18,7 @@ from data_tools.claims.kit.figures import show, subplots
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.mechanisms.gbuffer.environment import texel_directions
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import (
@@ -30,7 +31,6 @@ from minisplat_ref.mechanisms.gbuffer.population import (
 from minisplat_ref.mechanisms.gbuffer.prefilter import Filtered, prefilter
 from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
-from minisplat_ref.mechanisms.gbuffer.tone import tone
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
@@ -126,7 +126,7 @@ def trace(camera: Camera, light: Filtered, *, hides: bool = False) -> Truth:
     n = len(d)
     metal = Surface(np.full((n, 3), ALBEDO), np.ones(n), np.full(n, ROUGHNESS), normals, -d)
     image = np.zeros((HEIGHT, WIDTH, 3))
-    image[is_met] = np.where(is_hidden[:, None], 0, tone(shade(metal, light)[0]))
+    image[is_met] = np.where(is_hidden[:, None], 0, encode_srgb(shade(metal, light)[0]))
     return Truth(camera, image, is_met, normals, is_hidden)
 
 
@@ -192,7 +192,7 @@ def fit_harmonics(sphere: Gaussians, light: Filtered, n_directions: int = 120) -
         point = Surface(
             ALBEDO * np.ones((n_directions, 3)), flat, ROUGHNESS * flat, flat[:, None] * normals[k], to_camera
         )
-        target = tone(shade(point, light)[0]) - 0.5
+        target = encode_srgb(shade(point, light)[0]) - 0.5
         coefficients[k] = np.linalg.lstsq(sh_basis(-to_camera, 3), target, rcond=None)[0]
     return sphere._replace(sh_dc=coefficients[:, 0], sh_rest=coefficients[:, 1:])
 
@@ -252,7 +252,7 @@ def recover(views: list[Truth], rng: np.random.Generator) -> dict[str, float]:
     m, v, errors = np.zeros_like(log), np.zeros_like(log), []
 
     def error() -> float:
-        difference = (tone(np.exp(log)) - tone(target)) ** 2
+        difference = (encode_srgb(np.exp(log)) - encode_srgb(target)) ** 2
         return float(np.sqrt(np.sum(solid[..., None] * difference) / (12 * np.pi)))
 
     errors.append(error())

@@ -15,7 +15,6 @@ from minisplat_ref.datasets.synthetic.materials import (
     Material,
     Noise,
     Plain,
-    encode_srgb,
     linear_rgb,
     random_lattice,
 )
@@ -23,6 +22,7 @@ from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Rectangle, Sp
 from minisplat_ref.datasets.synthetic.sparse_points import project_points
 from minisplat_ref.datasets.synthetic.tracer import World, pixel_rays, radiance
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.srgb import encode_srgb
 from tolerances import (
     CLOSED_FORM,
     SYNTHETIC_COLOR_LEVELS,

@@ -35,7 +35,7 @@ from minisplat_ref.extensions.fans.model import (
     visible_mesh,
 )
 from minisplat_ref.io.ply import save_ply
-from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
@@ -338,7 +338,7 @@ def test_trimesh_opens_what_is_exported(suffix, model, tmp_path, capsys):
     if suffix == "glb":
         assert opened.visual.material.alphaMode == "BLEND" and opened.visual.material.doubleSided
         rgba = 255 * np.asarray(opened.visual.vertex_attributes["color"])
-        rgba[:, :3] = 255 * tone(rgba[:, :3] / 255)
+        rgba[:, :3] = 255 * encode_srgb(rgba[:, :3] / 255)
     else:
         rgba = opened.visual.vertex_colors
     n_channels = 3 if suffix == "obj" else 4

@@ -10,6 +10,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.reflective.model import RECIPE
 from minisplat_ref.io.images import read_image
+from minisplat_ref.io.srgb import decode_srgb, encode_srgb
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
 from minisplat_ref.mechanisms.gbuffer.population import (
     PER_PIXEL,
@@ -24,7 +25,6 @@ from minisplat_ref.mechanisms.gbuffer.population import (
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter
 from minisplat_ref.mechanisms.gbuffer.renderer import REFLECTIVE, render_reflective
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, shade
-from minisplat_ref.mechanisms.gbuffer.tone import tone, untone
 from minisplat_ref.mechanisms.gbuffer.training import restart_materials, shade_by, spread_normals
 from minisplat_ref.mechanisms.surfels.renderer import SURFELS
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -80,7 +80,7 @@ def test_albedo_alone_in_white_light_is_plain_surfels(stage, backend, rng):
     albedo = rng.uniform(0.1, 0.9, size=(30, 3)) if stage == PER_SURFEL else np.array([0.2, 0.4, 0.7])
     own = np.broadcast_to((albedo - 0.5) / SH_C0, (30, 3))
     g = g._replace(sh_dc=own, sh_rest=np.zeros((30, 0, 3)))
-    plain = g._replace(sh_dc=np.broadcast_to((tone(albedo) - 0.5) / SH_C0, (30, 3)))
+    plain = g._replace(sh_dc=np.broadcast_to((encode_srgb(albedo) - 0.5) / SH_C0, (30, 3)))
     request = Request(np.array([0.3, 0.2, 0.1]), backend=backend)
     expected, _ = SURFELS.render(Model(plain), view_from(camera), request)
     surfels = reflective(g, albedo if stage == PER_SURFEL else 0.5)
@@ -107,7 +107,7 @@ def test_a_wide_mirror_shows_each_pixel_its_own_direction(backend, rng):
     expected, _ = shade(Surface(0.9 * np.ones((len(n), 3)), flat, 0.3 * flat, n, to_camera), prefilter(environment))
     alpha = found.alpha.reshape(-1, 1)
     assert alpha.min() > 0.98 and np.ptp(expected) > 0.1
-    assert_allclose(found.image.reshape(-1, 3), alpha * tone(expected), atol=1e-6)
+    assert_allclose(found.image.reshape(-1, 3), alpha * encode_srgb(expected), atol=1e-6)
 
 
 def test_a_disc_in_the_way_is_seen_in_the_mirror(backend):
@@ -124,7 +124,7 @@ def test_a_disc_in_the_way_is_seen_in_the_mirror(backend):
     x, y = np.meshgrid(np.arange(24) + 0.5 - 12, np.arange(18) + 0.5 - 9)
     at = 10 * np.hypot(x, y) / 24 / 0.5  # in standard deviations of the disc
     alpha = 0.99 * np.exp(-(at**2) / 2)
-    expected = tone(np.maximum(1 - np.where(alpha > 1 / 255, alpha, 0), 1e-12)) / tone(np.ones(1))
+    expected = encode_srgb(np.maximum(1 - np.where(alpha > 1 / 255, alpha, 0), 1e-12)) / encode_srgb(np.ones(1))
     assert share.min() < 0.5
     assert_allclose(share[at > 3.4], 1, rtol=1e-6)
     assert_allclose(share, expected, atol=2e-3)
@@ -134,8 +134,8 @@ def test_the_start_shows_the_colours_of_the_points(rng):
     colors = np.array([[0.2, 0.5, 0.8], [0.0, 1.0, 0.5]])
     g = make_gaussians(rng, 2)._replace(sh_dc=(colors - 0.5) / SH_C0)
     found = with_materials(g, rng)
-    assert_allclose(tone(sigmoid(found.albedo_logits)), np.clip(colors, 0.02, 0.98), rtol=CLOSED_FORM)
-    assert_allclose(tone(0.5 + SH_C0 * found.sh_dc), np.clip(colors, 0.02, 0.98), rtol=CLOSED_FORM)
+    assert_allclose(encode_srgb(sigmoid(found.albedo_logits)), np.clip(colors, 0.02, 0.98), rtol=CLOSED_FORM)
+    assert_allclose(encode_srgb(0.5 + SH_C0 * found.sh_dc), np.clip(colors, 0.02, 0.98), rtol=CLOSED_FORM)
     assert_allclose(sigmoid(found.metallic_logits), 0.01, rtol=CLOSED_FORM)
     assert_allclose(sigmoid(found.roughness_logits), 0.1, rtol=CLOSED_FORM)
     assert not found.around_dc.any() and found.around_rest.shape == (2, 45) and not found.around_rest.any()
@@ -151,7 +151,7 @@ def test_light_from_around_is_what_a_hidden_mirror_shows(backend):
     shares = []
     for seen in (0.0, 0.5, 1.0):
         output, _ = render_reflective(model, view, Request(backend=backend), np.full((6, 8), seen), mirrors=True)
-        shares.append(untone(output.image[3, 4] / output.alpha[3, 4]))
+        shares.append(decode_srgb(output.image[3, 4] / output.alpha[3, 4]))
     assert_allclose(shares[0] / shares[2], 0.3 / 0.9, rtol=1e-6)
     assert_allclose(shares[1] / shares[2], 0.6 / 0.9, rtol=1e-6)
 

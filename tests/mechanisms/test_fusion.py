@@ -6,10 +6,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from data_tools.foreign_files.gltf import glb_parts, only_primitive, values
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.mechanisms.fusion import kernels, reference, volume
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest
 from minisplat_ref.mechanisms.fusion.volume import Contraction, DepthMap, Grid, Volume, empty_volume
-from minisplat_ref.mechanisms.gbuffer.tone import tone
 from minisplat_ref.mechanisms.meshes.files import check_suffix, to_glb, write_mesh
 from minisplat_ref.mechanisms.meshes.mesh import load_mesh
 from minisplat_ref.types import Camera
@@ -242,7 +242,7 @@ def test_other_programs_open_it(suffix, tmp_path):
     order = [int(np.argmin(np.abs(opened.vertices - v).sum(axis=1))) for v in expected]
     assert_allclose(opened.vertices[order], expected, atol=ROUNDED_TO_FLOAT32)
     if is_glb:
-        colors = 255 * tone(np.asarray(opened.visual.vertex_attributes["color"], float))
+        colors = 255 * encode_srgb(np.asarray(opened.visual.vertex_attributes["color"], float))
     else:
         colors = np.asarray(opened.visual.vertex_colors)[:, :3]
     assert_allclose(colors[order], np.rint(255 * TETRAHEDRON.colors), atol=1)
@@ -272,7 +272,7 @@ def test_colours_of_gltf_keep_every_level():
     levels = np.arange(256)
     many = ColoredMesh(np.eye(256, 3), TETRAHEDRON.faces, np.repeat(levels[:, None] / 255, 3, axis=1))
     _, _, colors, _ = read_glb(many)
-    assert_allclose(255 * tone(colors.astype(float)), np.repeat(levels[:, None], 3, axis=1), atol=1e-4)
+    assert_allclose(255 * encode_srgb(colors.astype(float)), np.repeat(levels[:, None], 3, axis=1), atol=1e-4)
 
 
 def test_the_material_of_gltf_is_matt_and_not_lit():

@@ -10,6 +10,7 @@ from scipy.integrate import dblquad, quad
 from gradcheck import check_inner_products
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.srgb import decode_srgb, encode_srgb, encode_srgb_vjp
 from minisplat_ref.mechanisms.gbuffer import renderer
 from minisplat_ref.mechanisms.gbuffer.brdf import hammersley, integrate, reflectance
 from minisplat_ref.mechanisms.gbuffer.environment import locate, read, texel_directions
@@ -18,7 +19,6 @@ from minisplat_ref.mechanisms.gbuffer.maps import map_image
 from minisplat_ref.mechanisms.gbuffer.pixels import Blended, find_rows, points_of
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, matte, prefilter, prefilter_vjp, reflected
 from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface, shade, shade_vjp
-from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp, untone
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.rendering import Request
@@ -230,16 +230,17 @@ def test_gradients_of_a_fine_environment(rng):
     assert_allclose(np.vdot(gradient, direction), expected, rtol=PARITY_FLOAT64 * image.size)
 
 
-def test_tone_is_that_of_srgb_and_has_no_end():
+def test_srgb_has_no_end():
     """0.5 is 188 of 255; the line has the slope 12.92."""
     linear = np.array([0.002, 0.5, 1.0, 4.0])
-    found = tone(linear)
+    found = encode_srgb(linear)
     assert_allclose(found[:3], [0.02584, 0.7353569830524495, 1.0], rtol=1e-12)
     assert found[3] > 1.8
-    assert_allclose(tone(np.array([0.0035])), 1.055 * 0.0035 ** (1 / 2.4) - 0.055, rtol=1e-12)  # just past the knee
-    assert_allclose(untone(found), linear, rtol=1e-12)
-    numeric = (tone(linear + 1e-6) - tone(linear - 1e-6)) / 2e-6
-    assert_allclose(tone_vjp(linear, np.ones(4)), numeric, rtol=1e-6)
+    just_past_the_knee = encode_srgb(np.array([0.0035]))
+    assert_allclose(just_past_the_knee, 1.055 * 0.0035 ** (1 / 2.4) - 0.055, rtol=1e-12)
+    assert_allclose(decode_srgb(found), linear, rtol=1e-12)
+    numeric = (encode_srgb(linear + 1e-6) - encode_srgb(linear - 1e-6)) / 2e-6
+    assert_allclose(encode_srgb_vjp(linear, np.ones(4)), numeric, rtol=1e-6)
 
 
 # --- visibility ---

@@ -26,13 +26,13 @@ from data_tools.claims import kit
 from data_tools.claims.kit.figures import plot_deviations, subplots, summarise
 from data_tools.claims.kit.tables import spread, table
 from minisplat_ref.datasets.synthetic.geometry import first_hits
-from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.tracer import World, points_along, radiance
 from minisplat_ref.extensions.lens.model import LENS, THROUGH_LENS
 from minisplat_ref.interface.palette import BLUE, GREY, RED
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io.lens import Lens, undistort
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.mechanisms.cameras.models import PERSPECTIVE, model_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Renderer, Request
@@ -90,7 +90,7 @@ def photograph(world: World, camera: Camera) -> Any:
         ids = np.full(len(directions), i % len(world.light_positions))
         hits = first_hits(world.primitives, camera.center, directions)
         light += np.clip(radiance(world, camera.center, directions, hits, ids), 0, 1)
-    image = np.round(255 * encode_srgb(light / SUPERSAMPLING**2)).astype(np.uint8)
+    image = np.round(255 * encode_srgb(np.clip(light / SUPERSAMPLING**2, 0, 1))).astype(np.uint8)
     return image.reshape(camera.height, camera.width, 3)
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.io.srgb import decode_srgb
 from minisplat_ref.types import Floats, Ints
 
 Texture = Callable[[Floats], Floats]
@@ -35,17 +36,6 @@ class Material(NamedTuple):
 def linear_rgb(hex_code: str) -> Floats:
     """[3] linear RGB of an sRGB colour such as ``"#e8dcc8"``."""
     return decode_srgb(np.array([int(hex_code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0)
-
-
-def decode_srgb(encoded: Floats) -> Floats:
-    """Values of sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-def encode_srgb(linear: Floats) -> Floats:
-    """Linear light [..., 3] to sRGB in [0, 1] (IEC 61966-2-1), clipped."""
-    clipped = np.clip(linear, 0.0, 1.0)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.datasets.synthetic.geometry import first_hits
-from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.tracer import (
     LIT_UP_TO,
     TracedView,
@@ -21,6 +20,7 @@ from minisplat_ref.datasets.synthetic.tracer import (
     points_along,
     radiance,
 )
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 N_VIEWS_MIN = 2  # a point is triangulated from at least two views

@@ -22,7 +22,7 @@ from minisplat_ref.datasets.synthetic.geometry import (
     rays_by_primitive,
     take_rows,
 )
-from minisplat_ref.datasets.synthetic.materials import encode_srgb
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.types import Camera, Floats, Ints
 
@@ -92,7 +92,7 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
         colors = radiance(world, origin, directions, first_hits(world.primitives, origin, directions), light_ids)
         samples = np.clip(colors, 0.0, 1.0).reshape(n_samples, len(block), camera.width, 3)
         light[block] = samples.mean(axis=0)  # of clipped samples: the edges of highlights stay smooth
-    image = np.round(255.0 * encode_srgb(light)).astype(np.uint8)
+    image = np.round(255.0 * encode_srgb(np.clip(light, 0, 1))).astype(np.uint8)
 
     directions = pixel_rays(camera, 0.5, 0.5, np.arange(camera.height))
     hits = first_hits(world.primitives, origin, directions)

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.datasets.synthetic.materials import encode_srgb
 from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Rectangle, Shape, Sphere
 from minisplat_ref.datasets.synthetic.tracer import World
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.types import Floats, Ints
 
 N_AROUND = 64  # vertices of a circle
@@ -35,7 +35,7 @@ def triangulate_world(world: World) -> Triangles:
     for index, primitive in enumerate(world.primitives):
         local, faces = triangulate(primitive.shape)
         vertices = local @ primitive.world_from_local_R.T + primitive.centre
-        colors = encode_srgb(primitive.material.texture(local))
+        colors = encode_srgb(np.clip(primitive.material.texture(local), 0, 1))
         parts.append(Triangles(vertices, faces + n_vertices, colors, np.full(len(faces), index)))
         n_vertices += len(vertices)
     return Triangles(*(np.concatenate(field) for field in zip(*parts, strict=True)))

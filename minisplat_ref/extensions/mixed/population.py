@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.mixed.projection import place_vertices
+from minisplat_ref.io.srgb import decode_srgb
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints
@@ -153,8 +154,7 @@ def _measure_spread(lab: Floats) -> float:
 
 def convert_to_lab(rgb: Floats) -> Floats:
     """Return CIE Lab colours of sRGB ones, [N, 3], of D65, after clipping to [0, 1]."""
-    rgb = np.clip(rgb.astype(np.float64), 0, 1)
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    linear = decode_srgb(np.clip(rgb.astype(np.float64), 0, 1))
     XYZ_FROM_SRGB = np.linalg.inv(SRGB_FROM_XYZ)
     relative = linear @ XYZ_FROM_SRGB.T / XYZ_FROM_SRGB.sum(axis=1)  # to white
     f = np.where(relative > LAB_KNEE**3, np.cbrt(relative), relative / (3 * LAB_KNEE**2) + 4 / 29)

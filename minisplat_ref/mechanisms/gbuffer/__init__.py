@@ -4,7 +4,6 @@
 ``prefilter``    the same light averaged over the lobe of a rough surface, and over the hemisphere of a matte one
 ``brdf``         what share of it a surface reflects: the table of the split-sum approximation
 ``shading``      the colour of a surface point from its material, its normal and the light
-``tone``         from light to sRGB
 ``lighting``     the environment that a model has, and another from a file
 ``maps``         materials and normals as pictures
 ``visibility``   how much of the surfels' own opacity lies in the way of a reflected ray

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from minisplat_ref.io.srgb import KNEE
 from minisplat_ref.mechanisms.gbuffer.around import light_around
 from minisplat_ref.mechanisms.gbuffer.brdf import SIZE
 from minisplat_ref.mechanisms.gbuffer.environment import locate
@@ -14,7 +15,6 @@ from minisplat_ref.mechanisms.gbuffer.population import STAGE
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, Filtered
 from minisplat_ref.mechanisms.gbuffer.renderer import ReflectiveTape, coefficients, has_own_colors
 from minisplat_ref.mechanisms.gbuffer.shading import Surface, mirror_rays
-from minisplat_ref.mechanisms.gbuffer.tone import KNEE
 from minisplat_ref.mechanisms.surfels import gradient_checks as of_surfels
 from minisplat_ref.oracle.models import Drawn, model_stage
 from minisplat_ref.oracle.setting import Setting

@@ -11,8 +11,8 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
+from minisplat_ref.io.srgb import decode_srgb
 from minisplat_ref.mechanisms.gbuffer.prefilter import check_size
-from minisplat_ref.mechanisms.gbuffer.tone import untone
 from minisplat_ref.types import Floats, Model
 
 ENVIRONMENT = "log_environment"  # name of the shared parameter
@@ -47,7 +47,7 @@ def read_environment(path: Path) -> Floats:
         except (OSError, ValueError, EOFError) as error:
             raise InputError(f"{path}: not an array of NumPy ({error})") from None
     else:
-        found = untone(read_image(path)[:, :, :3] / 255.0)
+        found = decode_srgb(read_image(path)[:, :, :3] / 255.0)
     if found.ndim != 3 or found.shape[2] != 3 or found.dtype.kind not in "fiu":
         raise InputError(f"{path}: an environment has the shape (H, 2 H, 3), not {found.shape}")
     try:

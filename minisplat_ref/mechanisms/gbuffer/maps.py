@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from minisplat_ref.mechanisms.gbuffer.tone import tone
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.types import Floats
 
 
@@ -17,6 +17,6 @@ def map_image(name: str, sums: Floats, alpha: Floats) -> np.ndarray:
         length = np.linalg.norm(means, axis=2, keepdims=True)
         means = (means / np.where(length > 0, length, 1) + 1) / 2
     elif name == "albedo":
-        means = tone(means)
+        means = encode_srgb(means)
     shown = np.broadcast_to(np.where(is_hit, means, 0), (*alpha.shape, 3))
     return np.round(255 * np.clip(shown, 0, 1)).astype(np.uint8)

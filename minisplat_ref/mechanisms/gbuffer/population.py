@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_C0
+from minisplat_ref.io.srgb import decode_srgb
 from minisplat_ref.mechanisms.gbuffer.lighting import ENVIRONMENT
-from minisplat_ref.mechanisms.gbuffer.tone import untone
 from minisplat_ref.mechanisms.surfels.discs import as_surfels
 from minisplat_ref.types import Floats, Gaussians, Scene
 
@@ -49,7 +49,7 @@ def with_materials(gaussians: Gaussians, rng: np.random.Generator) -> Reflective
     """
     surfels = as_surfels(gaussians, rng)
     colors = np.clip(0.5 + SH_C0 * surfels.sh_dc, *ALBEDO_RANGE)
-    linear = untone(colors)
+    linear = decode_srgb(colors)
     n, dtype = len(colors), surfels.means.dtype
     n_rest = 3 * ((AROUND_DEGREE + 1) ** 2 - 1)
     return ReflectiveSurfels(

@@ -3,7 +3,7 @@
 The shared parameter ``shading_stage`` selects which (:mod:`.population`). Per surfel, each has a colour, which is
 blended as in 2D Gaussian Splatting. Per pixel, materials, normals, own colours and the light from around are blended::
 
-    X = sum_i w_i x_i / A,   n = sum_i w_i n_i / |sum_i w_i n_i|,   image = A tone(shade(X, n)) + (1 - A) background
+    X = sum_i w_i x_i / A,   n = sum_i w_i n_i / |sum_i w_i n_i|,   image = A sRGB(shade(X, n)) + (1 - A) background
 
 An own colour is what harmonics make of the viewing direction, as in 3DGS, but linear; per pixel it takes the place of
 what the albedo scatters of the environment, as in the released code. A population without ``around_dc`` has neither it
@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.srgb import encode_srgb, encode_srgb_vjp
 from minisplat_ref.mechanisms.gbuffer import around, around_kernels, pixel_kernels, pixels, shading, shading_kernels
 from minisplat_ref.mechanisms.gbuffer.around import (
     Coefficients,
@@ -38,7 +39,6 @@ from minisplat_ref.mechanisms.gbuffer.population import (
 )
 from minisplat_ref.mechanisms.gbuffer.prefilter import prefilter, prefilter_vjp
 from minisplat_ref.mechanisms.gbuffer.shading import Around, Surface, mirror_rays
-from minisplat_ref.mechanisms.gbuffer.tone import tone, tone_vjp
 from minisplat_ref.mechanisms.gbuffer.visibility import transmittances
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.mechanisms.surfels import renderer as discs
@@ -126,7 +126,7 @@ class ReflectiveTape(NamedTuple):
     sight: Sight
     sh_degree: int | Ints  # of own colours
     shading: Any  # tape of ``shade``
-    linear: Floats  # [M or P, 3] colours before the tone curve
+    linear: Floats  # [M or P, 3] colours before the curve of sRGB
     encoded: Floats  # [M or P, 3] and after it
     environment: Floats  # [H, 2 H, 3]
     points: Points | None  # of shading per pixel
@@ -207,7 +207,7 @@ def render_reflective(
     if stage < PER_PIXEL:
         surface = _surface(carried[rows], sight.normals @ sight.R, -sight.d @ sight.R)
         linear, shaded = twins.shading.shade(surface, light, mirrors=mirrors)
-        encoded = colors[rows] = tone(linear)
+        encoded = colors[rows] = encode_srgb(linear)
         output, tape = discs.blend(seen, colors, carried if maps else carried[:, :0], own)
         image, points, rgb = output.image, None, output.image[:, :, :3]
     else:
@@ -229,7 +229,7 @@ def render_reflective(
             hidden = Around(sees, points.further)
         scattered = points.own if has_own_colors(g) else None
         linear, shaded = twins.shading.shade(points.surface, light, hidden, mirrors, scattered)
-        encoded, A = tone(linear), points.alpha[:, None]
+        encoded, A = encode_srgb(linear), points.alpha[:, None]
         behind = _background(request, dtype)
         rgb = np.broadcast_to(behind, (*output.alpha.shape, 3)).copy()
         rgb.reshape(-1, 3)[shown] = A * encoded + (1 - A) * behind
@@ -251,7 +251,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
     Per pixel::
 
         v_X = v_shade / A,   v_N = (v_n - n (n.v_n)) / |N|
-        v_A = v_image . (tone - background) - sum v_X . X,   v_background = sum (1 - A) v_image
+        v_A = v_image . (sRGB - background) - sum v_X . X,   v_background = sum (1 - A) v_image
     """
     g, dtype, request = tape.model.gaussians, tape.linear.dtype, tape.request
     v_alpha = np.zeros(v_image.shape[:2], v_image.dtype) if v_alpha is None else v_alpha.copy()
@@ -264,7 +264,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         A, v_seen = p.alpha[:, None], rgb[p.rows]
         v_shown = A * v_seen
         v_background = rgb.sum(axis=0) - v_shown.sum(axis=0)
-        v = twins.shading.shade_vjp(tape.shading, tone_vjp(tape.linear, v_shown))
+        v = twins.shading.shade_vjp(tape.shading, encode_srgb_vjp(tape.linear, v_shown))
         v_alpha.reshape(-1)[p.rows] += np.sum(v_seen * (tape.encoded - _background(request, dtype)), axis=1)
         v_sums[:, :, :3] = 0
         camera = with_principal_point(tape.seen.camera, request.conventions)
@@ -288,7 +288,7 @@ def render_reflective_vjp(tape: ReflectiveTape, v_image: Floats, v_alpha: Floats
         v_blend = discs.blend_vjp(tape.blend, v_sums, v_alpha)
         v_background, v_carried = v_blend.background, np.zeros((len(g.means), N_MATERIAL), dtype)
         v_carried[:, : v_blend.carried.shape[1]] = v_blend.carried
-        v = twins.shading.shade_vjp(tape.shading, tone_vjp(tape.linear, v_blend.colors[tape.rows]))
+        v = twins.shading.shade_vjp(tape.shading, encode_srgb_vjp(tape.linear, v_blend.colors[tape.rows]))
         v_carried[tape.rows, :3] += v.surface.albedo
         v_carried[tape.rows, 3] += v.surface.metallic
         v_carried[tape.rows, 4] += v.surface.roughness

@@ -13,8 +13,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.formats import GLTF_AXES, write_content
 from minisplat_ref.io.ply import COLORS, MEANS
 from minisplat_ref.io.ply_file import write_vertices
+from minisplat_ref.io.srgb import decode_srgb
 from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh
-from minisplat_ref.mechanisms.gbuffer.tone import untone
 from minisplat_ref.types import Floats, Ints
 
 SUFFIXES = (".ply", ".glb", ".obj")
@@ -119,7 +119,7 @@ def to_glb(vertices: Floats, colors: Floats, faces: Ints, **material: Any) -> by
         trimesh is not installed.
     """
     shares = np.clip(colors, 0, 1)
-    linear = np.column_stack([untone(shares[:, :3]), shares[:, 3:]]).astype(np.float32)
+    linear = np.column_stack([decode_srgb(shares[:, :3]), shares[:, 3:]]).astype(np.float32)
     matt = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
 
     def add_material(tree: dict[str, Any]) -> None:

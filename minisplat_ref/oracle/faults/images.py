@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.oracle.faults import blending as b
 from minisplat_ref.oracle.faults import forward as f
 from minisplat_ref.oracle.faults.backward import as_planted
@@ -69,11 +70,6 @@ def _without_partial_tiles(arrays: Arrays, size: float) -> Arrays:
         return changed
 
     return _images(cut)(arrays, size)
-
-
-def _srgb(c: Floats) -> Floats:
-    c = np.maximum(c, 0)
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.maximum(c, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def _weighed(weigh: Any) -> Callable[[float], Any]:
@@ -146,7 +142,7 @@ BLENDING = (
         "tiles that are not whole left out, {} pixels wide", "image", after=_without_partial_tiles, sizes=(16, 8, 32)
     ),
     Fault("colours of the image clamped at 1", "image", after=_colored(lambda c, _: np.minimum(c, 1))),
-    Fault("colours of the image in sRGB", "image", after=_colored(lambda c, _: _srgb(c))),
+    Fault("colours of the image in sRGB", "image", after=_colored(lambda c, _: encode_srgb(np.maximum(c, 0)))),
     Fault(
         "colours of the image to the power of {}",
         "image",
