@@ -69,8 +69,8 @@ class Pace(NamedTuple):
     """Names of the calibrations that the photographs turned out to need."""
     is_pruning: bool = False
     """Whether views are still held back while the rates fall, to measure what the prune costs."""
-    before_slices: tuple[Measurement, ...] = ()
-    """Evaluations before each slice of the prune."""
+    while_cooling: tuple[Measurement, ...] = ()
+    """Evaluations while the rates fall, before and between the slices of the prune."""
 
     @property
     def holds_out(self) -> bool:
@@ -117,12 +117,16 @@ class Cooling(NamedTuple):
     the holding back, too."""
 
     def factors(self, step: int, pace: Pace) -> tuple[float, float]:
-        """Return the factors of the rates, and of those per unit of the extent, at an iteration."""
+        """Return the factors of the rates, and of those per unit of the extent, at an iteration.
+
+        The latter are halved whenever the width and height of the views double, so that a step stays as many pixels.
+        """
+        finer = 0.5**pace.n_finer
         if pace.cooling_from is None or pace.last_step is None:
-            return 1.0, 1.0
+            return 1.0, finer
         progress = (step - pace.cooling_from) / max(pace.last_step - pace.cooling_from, 1)
         progress = min(max(progress, 0.0), 1.0)
-        return self.last**progress, self.last_per_extent**progress
+        return self.last**progress, finer * self.last_per_extent**progress
 
     def latest_start(self, iterations: int) -> int:
         """Return the iteration after which the cool-down has to begin to end at ``iterations``."""
@@ -169,7 +173,7 @@ def pace_to_json(pace: Pace) -> dict[str, Any]:
         **pace._asdict(),
         "measurements": [m._asdict() for m in pace.measurements],
         "decisions": [d._asdict() for d in pace.decisions],
-        "before_slices": [m._asdict() for m in pace.before_slices],
+        "while_cooling": [m._asdict() for m in pace.while_cooling],
     }
 
 
@@ -182,7 +186,7 @@ def pace_from_json(value: Mapping[str, Any]) -> Pace:
         It is something else.
     """
     measurements = tuple(map(_measurement, value["measurements"]))
-    before_slices = tuple(map(_measurement, value.get("before_slices", ())))  # not in older checkpoints
+    while_cooling = tuple(map(_measurement, value.get("while_cooling", ())))  # not in older checkpoints
     decisions = tuple(
         Decision(int(d["step"]), str(d["what"]), str(d["why"]), _optional(d["gain"]), _optional(d["standard_error"]))
         for d in value["decisions"]
@@ -191,7 +195,7 @@ def pace_from_json(value: Mapping[str, Any]) -> Pace:
     switched_on = tuple(str(name) for name in value["switched_on"])
     is_pruning = bool(value.get("is_pruning", False))
     return Pace(
-        measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on, is_pruning, before_slices
+        measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on, is_pruning, while_cooling
     )
 
 

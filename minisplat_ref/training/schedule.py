@@ -197,10 +197,10 @@ class Recipe(NamedTuple):
         return functools.reduce(Rates.join, (calibration.rates for calibration in self.active_calibrations), rates)
 
     def rates_at(self, step: int, extent: float, pace: Pace) -> dict[str, float]:
-        """Return the learning rates of an iteration in a scene of this extent; they fall during a cool-down."""
+        """Return the learning rates of an iteration in a scene of this extent; see :meth:`Cooling.factors`."""
         rates = self.rates
         values = rates.at(step, extent)
-        if self.cooling is None or pace.cooling_from is None:
+        if self.cooling is None:
             return values
         factor, factor_per_extent = self.cooling.factors(step, pace)
         return {name: v * (factor_per_extent if name in rates.per_extent else factor) for name, v in values.items()}

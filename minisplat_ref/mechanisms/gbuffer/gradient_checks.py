@@ -34,7 +34,7 @@ def sides_of(surface: Surface, light: Filtered, linear: Floats) -> list[np.ndarr
     surface, light
         The arguments of :func:`minisplat_ref.mechanisms.gbuffer.shading.shade`.
     linear : ndarray of shape (P, 3)
-        The colours that it returned, before the tone curve.
+        The colours that it returned, before the curve of sRGB.
     """
     cosines, r = mirror_rays(surface)
     sides = [locate(r, *image.shape[:2]).texels for image in light.maps]

@@ -133,7 +133,7 @@ MASK_VIEWS_MAX = 24
 # --- pruning ---
 
 SEEN_BY_MIN = 2
-"""Views that must see a Gaussian when the rates begin to fall. No reason recorded."""
+"""Views that must see a Gaussian when the first slice comes. No reason recorded."""
 REMOVAL_SLOPE_MIN = 1.0
 """Relative rise of the squared error over the relative fall of the count, from which a Gaussian stays: 3 dB for each
 doubling of the count, before training adapts the others to replace it. Less keeps more Gaussians for under 0.1 dB
@@ -145,6 +145,9 @@ PSNR_COST_MAX, SSIM_COST_MAX = 0.1, 0.005
 COST_RISE = 2.0
 """Assumed cost of a slice, as a multiple of the one before: each slice removes more important Gaussians. With 1,
 the last slice of the room cost 0.24 dB (L)."""
+N_UNPRUNED = 5
+"""Measurements while the rates fall before the first slice, by which what it costs is told from what the rates gain
+(S)."""
 N_SLICES = 8
 """Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
 eight."""

@@ -1,25 +1,28 @@
 """Pruning of ``adaptive``: in slices, while the rates fall, Gaussians that the photographs would hardly miss.
 
-The error falls because the rates do. The contribution of most Gaussians to the images is then known:
+The contribution of most Gaussians to the images is then known:
 :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each of them, in one pass over
 the training views. Those that are not worth their place are removed, a slice at a time; after each slice the training
 repairs what it can, and the changes are recomputed.
 
-The cost is measured, too, on the training views that are held out: before each slice their PSNR and SSIM are
-compared with the best so far. When the next slice would cost more than a tenth of a decibel, or five thousandths of
-SSIM, in all, the prune ends. To let the prune go on within the standard error of this cost was tried: two views agree
-or disagree by chance, and on ten photographs it removed Gaussians that held-out ones needed (N). The prune also ends
-where no further slice is due: at the end of the cool-down nothing is removed, and all photographs are trained on, so
-that it can converge.
+The cost is measured, too, on the training views that are held out. Meanwhile their error falls because the rates do,
+which hides what the slices cost; so a line predicts what the error would be without them. The squared error of a view
+is ``a + b r``, where r is the factor of the means' rate: what the model cannot show, and what comes of steps that are
+too long. Both are fitted to N_UNPRUNED measurements before the first slice; so are those of 1 - SSIM. When the next
+slice would cost more than a tenth of a decibel, or five thousandths of SSIM, in all, the prune ends. To let the prune
+go on within the standard error of this cost was tried: two views agree or disagree by chance, and on ten photographs
+it removed Gaussians that held-out ones needed (N). The prune also ends where no further slice is due: at the end of the
+cool-down nothing is removed, and all photographs are trained on, so that it can converge.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.methods.adaptive.numbers import COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
+from minisplat_ref.methods.adaptive.numbers import COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, N_UNPRUNED, SLICE_MIN
 from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
@@ -27,17 +30,22 @@ from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.strategy.removal import collect_removal_costs, select_worthwhile
 from minisplat_ref.training.pace import Decision, Measurement, Pace
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
+from minisplat_ref.types import Floats
 
 
 def slice_due(pace: Pace, step: int) -> int | None:
-    """Return which slice is due at an iteration, from 0; None where none is."""
+    """Return which slice is due at an iteration, from 0; None where none is.
+
+    Before them are N_UNPRUNED moments at which the held-out views are only measured, the last of which is -1.
+    """
     if pace.cooling_from is None or pace.last_step is None:
         return None
     last = LAST_SLICE * (pace.last_step - pace.cooling_from)
-    every = max(GAP_MIN, int(last / N_SLICES))
+    every = max(GAP_MIN, int(last / (N_UNPRUNED + N_SLICES)))
     since = step - pace.cooling_from - 1
-    number, rest = divmod(since, every)
-    return number if rest == 0 and 0 <= number < N_SLICES and since <= last else None
+    moment, rest = divmod(since, every)
+    is_due = rest == 0 and 0 <= moment < N_UNPRUNED + N_SLICES and since <= last
+    return moment - N_UNPRUNED if is_due else None
 
 
 def prune_in_slices(
@@ -75,12 +83,15 @@ def prune_in_slices(
         return
     iteration.fetch()
     now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
-    state.pace = state.pace._replace(before_slices=(*state.pace.before_slices, now))
-    psnr, ssim = foresee_costs(state.pace.before_slices)
+    state.pace = state.pace._replace(while_cooling=(*state.pace.while_cooling, now))
+    if number < 0:
+        return
+    rates = [iteration.cooling.factors(m.step, state.pace)[1] for m in state.pace.while_cooling]
+    psnr, ssim = foresee_costs(state.pace.while_cooling, rates)
     if psnr.mean > max_psnr_cost or ssim.mean > max_ssim_cost:
         why = (
-            f"with more removed, the held-out views might lose {psnr.mean:.2f} ± {psnr.standard_error:.2f} dB and"
-            f" {ssim.mean:.4f} ± {ssim.standard_error:.4f} of SSIM in all; at most {max_psnr_cost:g} dB and"
+            f"with more removed, the held-out views might lose {psnr.mean:z.2f} ± {psnr.standard_error:.2f} dB and"
+            f" {ssim.mean:z.4f} ± {ssim.standard_error:.4f} of SSIM in all; at most {max_psnr_cost:g} dB and"
             f" {max_ssim_cost:g} are allowed"
         )
         state.pace = state.pace.with_decision(Decision(iteration.step, "prune ended", why, None, None))
@@ -121,21 +132,48 @@ class Cost(NamedTuple):
     """Of the mean."""
 
 
-def foresee_costs(before_slices: Sequence[Measurement]) -> tuple[Cost, Cost]:
+def foresee_costs(measurements: Sequence[Measurement], rates: Sequence[float]) -> tuple[Cost, Cost]:
     """Return the estimated cost of the prune after one more slice: PSNR in dB, and SSIM.
 
-    The cost so far is the value of the slice with the best mean less the present one; one more slice is assumed to cost
-    ``COST_RISE`` times as much as the last one, unless the views have gained by that. Before the first slice both
-    are 0.
+    The cost so far is the value that the first N_UNPRUNED measurements predict, less the present one; one more slice is
+    assumed to cost ``COST_RISE`` times as much as the last one, unless the views have gained by that. Before the first
+    slice both are 0.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurement
+        At the moments of :func:`slice_due` so far.
+    rates : sequence of float
+        Factor of the means' rate at each.
     """
-    return _foresee([m.psnrs for m in before_slices]), _foresee([m.ssims for m in before_slices])
+    if len(measurements) <= N_UNPRUNED + 1:
+        return Cost(0.0, 0.0), Cost(0.0, 0.0)
+    errors = 10.0 ** (-np.array([m.psnrs for m in measurements]) / 10.0)
+    dissimilarities = 1.0 - np.array([m.ssims for m in measurements])
+    psnr_costs = 10.0 * np.log10(errors / predict_unpruned(errors, rates))
+    return _foresee(psnr_costs), _foresee(dissimilarities - predict_unpruned(dissimilarities, rates))
 
 
-def _foresee(before_slices: Sequence[Sequence[float]]) -> Cost:
-    """Return the cost of one more slice by the values [S, V] before each slice, of each view."""
-    values = np.array(before_slices)
-    last = values[-2] - values[-1] if len(values) > 1 else np.zeros(values.shape[1])
-    lost = values[values.mean(axis=1).argmax()] - values[-1] + (COST_RISE * last if last.mean() > 0 else 0.0)
+def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
+    """Return the errors [S, V] without a prune: a + b r with a >= 0, fitted to the first N_UNPRUNED of each view.
+
+    Parameters
+    ----------
+    errors : ndarray of shape (S, V)
+        Of V views at S moments, above 0.
+    rates : sequence of S floats
+        r, factor of the means' rate at each moment.
+    """
+    terms = np.stack([np.ones(len(rates)), np.asarray(rates)], axis=1)  # [S, 2]
+    bounds = [0.0, -np.inf], np.inf  # of a and b: views that learn what is not in others lose by falling rates
+    fits = [lsq_linear(terms[:N_UNPRUNED], of_view[:N_UNPRUNED], bounds).x for of_view in errors.T]
+    return terms @ np.transpose(fits)
+
+
+def _foresee(costs: Floats) -> Cost:
+    """Return the cost of one more slice by the costs [S, V] at the moments so far, of each view."""
+    last = costs[-1] - costs[-2]
+    lost = costs[-1] + (COST_RISE * last if last.mean() > 0 else 0.0)
     return Cost(float(lost.mean()), float(lost.std(ddof=1) / np.sqrt(len(lost))))
 
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
@@ -15,7 +15,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.adaptive import prune
 from minisplat_ref.methods.adaptive.growth import grow
 from minisplat_ref.methods.adaptive.progress import proceed_when_little_is_gained
-from minisplat_ref.methods.adaptive.prune import N_SLICES, foresee_costs, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.prune import GAP_MIN, N_SLICES, N_UNPRUNED, prune_in_slices, slice_due
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.rendering import SPLATTING, RenderSettings
@@ -25,7 +25,10 @@ from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import (
+    COOLED,
+    FINER,
     Cooling,
+    Decision,
     Measurement,
     Pace,
     held_out_ids,
@@ -89,7 +92,8 @@ def test_it_ends_after_the_cool_down(reports):
     seen, state = reports
     decision, *others = state.pace.decisions
     pruned = [other for other in others if other.what == "prune"]
-    assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned[0].step - 1
+    assert decision.what == "cool down" and decision.step == state.pace.cooling_from
+    assert pruned[0].step == decision.step + 1 + N_UNPRUNED * GAP_MIN
     assert [other.step for other in others if other.what == "bands"] == [decision.step + 1]
     assert {other.what for other in others} == {"prune", "prune ended", "bands"}
     assert state.step == state.pace.last_step == min(700, decision.step + -(-6 * decision.step // 10))
@@ -150,6 +154,19 @@ def test_factors_fall_on_a_line_of_logarithms():
     assert cooling.factors(200, pace) == pytest.approx((0.1, 0.01))
 
 
+def test_a_step_stays_as_many_pixels_when_views_double():
+    """Two doublings: a quarter of the rate of the means, before the rates fall and at their end; others as they are."""
+    finer = tuple(Decision(step, FINER, "why", 0.1, 0.1) for step in (1000, 1500))
+    ended = Decision(2000, COOLED, "why", 0.1, 0.1)
+    open_ended, ending = Pace(decisions=finer), Pace(decisions=(*finer, ended), cooling_from=2000, last_step=3000)
+    rates, first = ADAPTIVE.rates_at(1600, 2.0, open_ended), ADAPTIVE.rates_at(900, 2.0, Pace())
+    last = ADAPTIVE.rates_at(3000, 2.0, ending)
+    assert rates["means"] == pytest.approx(first["means"] / 4)
+    assert last["means"] == pytest.approx(first["means"] / 400)
+    for name in first.keys() - {"means"}:
+        assert rates[name] == first[name] and last[name] == pytest.approx(first[name] / 10)
+
+
 # How it grows ---------------------------------------------------------------------------------------------------------
 
 
@@ -187,17 +204,18 @@ def test_a_budget_is_a_ceiling(scene):
 
 
 def test_slices_are_spread_over_the_first_part_of_the_cool_down():
-    pace = Pace(cooling_from=1000, last_step=1600)
+    pace = Pace(cooling_from=1000, last_step=1650)
     due = {step: slice_due(pace, step) for step in range(900, 1700) if slice_due(pace, step) is not None}
-    assert due == {1001 + 48 * k: k for k in range(N_SLICES)}  # 48 is 0.64 * 600 / 8
+    assert due == {1161 + 32 * k: k for k in range(-N_UNPRUNED, N_SLICES)}  # 32 is 0.64 * 650 / 13
     assert slice_due(pace._replace(cooling_from=None, last_step=None), 1001) is None
-    short = Pace(cooling_from=10, last_step=50)  # slices are 20 iterations apart, and none comes after 0.64 of 40
-    assert [(step, slice_due(short, step)) for step in (10, 11, 12, 31, 50)] == [
+    short = Pace(cooling_from=10, last_step=180)  # they are 20 iterations apart, and none comes after 0.64 of 170
+    assert [(step, slice_due(short, step)) for step in (10, 11, 12, 111, 112, 131)] == [
         (10, None),
-        (11, 0),
+        (11, -5),
         (12, None),
-        (31, 1),
-        (50, None),
+        (111, 0),
+        (112, None),
+        (131, None),
     ]
 
 
@@ -210,19 +228,19 @@ def cooling(scene):
     state = initial_state(scene, ADAPTIVE._replace(starts_densely=False), 0)
     centres = np.array([view.camera.center for view in scene.train_views])
     state.gaussians.means[0] = 100 * (centres.mean(axis=0) - scene.points.mean(axis=0))
-    state.pace = Pace(cooling_from=10, last_step=110, is_pruning=True)
+    state.pace = Pace(cooling_from=10, last_step=270, is_pruning=True)  # the first slice is due at 111
     here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background))
     return state, here._replace(cooling=ADAPTIVE.cooling)
 
 
-def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
+def test_what_few_views_see_goes_with_the_first_slice(cooling):
     state, here = cooling
     before = state.gaussians
-    for step in (10, 12):
+    for step in (110, 112):
         prune_in_slices(state, here._replace(step=step), **PRUNING)
         assert state.gaussians is before
     is_visible = measure_importance(state, here).is_visible
-    prune_in_slices(state, here._replace(step=11), **PRUNING | {"min_slope": 0.0})
+    prune_in_slices(state, here._replace(step=111), **PRUNING | {"min_slope": 0.0})
     assert_array_equal(state.gaussians.means, before.means[is_visible.sum(axis=1) >= 2])
     (decision,) = state.pace.decisions
     assert decision.what == "prune" and "fewer than 2 views" in decision.why
@@ -232,35 +250,18 @@ def test_what_the_photographs_would_hardly_miss_goes_in_slices(cooling):
     state, here = cooling
     before, settings = state.gaussians, PRUNING | {"min_views": 0}
     keep_out = collect_removal_costs(state.model, here.scene.train_views, RenderSettings(here.scene.background))
-    prune_in_slices(state, here._replace(step=31), **settings | {"min_slope": 1e9})
+    prune_in_slices(state, here._replace(step=131), **settings | {"min_slope": 1e9})
     assert_array_equal(state.gaussians.means, before.means[np.sort(np.argsort(keep_out.changes, kind="stable")[40:])])
     assert "without 40 of 200 Gaussians the training views lose only" in state.pace.decisions[-1].why
-    prune_in_slices(state, here._replace(step=51), **settings | {"min_slope": 1e-9})
+    prune_in_slices(state, here._replace(step=151), **settings | {"min_slope": 1e-9})
     assert len(state.gaussians.means) == 160 and len(state.pace.decisions) == 1  # a slice of less than 1 % is left out
 
 
 def of_values(psnrs, ssims):
     return [
-        Measurement(10 * k, (p - 1, p + 1), 10, 0, (s, s)) for k, (p, s) in enumerate(zip(psnrs, ssims, strict=True))
+        Measurement(11 + 20 * k, (p - 1, p + 1), 10, 0, (s, s))
+        for k, (p, s) in enumerate(zip(psnrs, ssims, strict=True))
     ]
-
-
-def test_what_the_prune_will_have_cost():
-    """The best less the present value, and twice what the last slice cost."""
-    assert foresee_costs(of_values([20.0], [0.5])) == ((0.0, 0.0), (0.0, 0.0))
-    assert_allclose(foresee_costs(of_values([20.0, 20.3], [0.5, 0.49])), [(0.0, 0.0), (0.03, 0.0)], atol=1e-12)
-    costs = foresee_costs(of_values([20.0, 20.3, 20.25, 20.22], [0.5] * 4))
-    assert_allclose(costs, [(0.08 + 0.06, 0.0), (0.0, 0.0)], atol=1e-12)
-
-
-def test_views_that_disagree_make_the_cost_uncertain():
-    """One view loses 0.2 dB, the other gains 0.1; with twice that to come 0.6 and -0.3: 0.15 dB, and 0.45 is its error.
-
-    The deviations from the mean are 0.45 each: the root of 2 x 0.45^2 / (2 - 1) / 2.
-    """
-    slices = [Measurement(10 * k, psnrs, 10, 0, (0.5, 0.5)) for k, psnrs in enumerate([(20.0, 22.0), (19.8, 22.1)])]
-    cost, _ = foresee_costs(slices)
-    assert_allclose(cost, (0.15, 0.45), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -269,30 +270,32 @@ def test_views_that_disagree_make_the_cost_uncertain():
 def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypatch, limits, ends):
     """After a slice that cost 0.1 dB and 0.01 of SSIM, the next would make it thrice as much; then all train."""
     state, here = cooling
-    values = iter(of_values([20.0, 19.9, 19.9], [0.50, 0.49, 0.49]))
+    *unpruned, first, second, third = of_values([20.0] * 6 + [19.9] * 2, [0.50] * 6 + [0.49] * 2)
+    state.pace = state.pace._replace(while_cooling=tuple(unpruned))
+    values = iter((first, second, third))
     monkeypatch.setattr(prune, "evaluate_held_out", lambda *_, **__: next(values))
     settings = PRUNING | {"min_slope": 1e9, "max_psnr_cost": limits[0], "max_ssim_cost": limits[1]}
     n_trained = len(trained_ids(len(here.scene.train_views), here.cooling, state.pace))
     assert n_trained < len(here.scene.train_views)
-    prune_in_slices(state, here._replace(step=11), **settings)
+    prune_in_slices(state, here._replace(step=111), **settings)
     state.view_order = [1, 2]
-    prune_in_slices(state, here._replace(step=31), **settings)
+    prune_in_slices(state, here._replace(step=131), **settings)
     assert state.pace.is_pruning == (not ends) and ends in state.pace.decisions[-1].why
     assert len(trained_ids(len(here.scene.train_views), here.cooling, state.pace)) == (
         len(here.scene.train_views) if ends else n_trained
     )
     assert (state.view_order == []) == bool(ends)
     n = len(state.gaussians.means)
-    prune_in_slices(state, here._replace(step=51), **settings)
+    prune_in_slices(state, here._replace(step=151), **settings)
     assert (len(state.gaussians.means) == n) == bool(ends)
 
 
 def test_the_prune_ends_where_no_slice_is_due_anymore(cooling):
-    """After 64 of 100 iterations, whether the last slice was one or not."""
+    """After 0.64 of 260 iterations, which is 166.4, whether the last slice was one or not."""
     state, here = cooling
-    prune_in_slices(state, here._replace(step=75), **PRUNING)
+    prune_in_slices(state, here._replace(step=177), **PRUNING)
     assert state.pace.is_pruning
-    prune_in_slices(state, here._replace(step=76), **PRUNING)
+    prune_in_slices(state, here._replace(step=178), **PRUNING)
     assert not state.pace.is_pruning
 
 
@@ -305,8 +308,8 @@ def test_a_renderer_that_does_not_say_is_not_pruned_by_it(cooling):
     said = []
     settings = here.render_settings._replace(renderer=SPLATTING._replace(name="silent", render=render))
     silent = here._replace(render_settings=settings, say=said.append)
-    prune_in_slices(state, silent._replace(step=11), **PRUNING)
-    prune_in_slices(state, silent._replace(step=31), **PRUNING)
+    prune_in_slices(state, silent._replace(step=111), **PRUNING)
+    prune_in_slices(state, silent._replace(step=131), **PRUNING)
     assert len(said) == 1 and "renderer silent does not say" in said[0]
     assert len(state.pace.decisions) == 1
 

@@ -4,9 +4,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from minisplat_ref.methods.adaptive import prune
-from minisplat_ref.methods.adaptive.prune import is_prune_done, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.prune import (
+    foresee_costs,
+    is_prune_done,
+    predict_unpruned,
+    prune_in_slices,
+    slice_due,
+)
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.removal import RemovalCosts
@@ -19,7 +26,8 @@ from scenes import balls, make_camera
 
 N = 200
 SETTINGS = {"min_views": 2, "min_slope": 1.0, "max_pruned": 0.2, "max_psnr_cost": 0.1, "max_ssim_cost": 0.005}
-FIRST, SECOND = 1001, 1049  # iterations of the first two slices: 600 * 0.64 / 8 = 48
+UNPRUNED = 1001, 1033, 1065, 1097, 1129  # measured before the first slice: 650 * 0.64 / 13 = 32
+FIRST, SECOND, THIRD, FOURTH = 1161, 1193, 1225, 1257  # iterations of slices
 
 
 def test_its_numbers():
@@ -33,7 +41,7 @@ def setting(monkeypatch):
     model = balls(np.column_stack([np.arange(float(N)), np.zeros((N, 2))]), np.full(N, 0.1), np.full(N, 0.5))
     views = tuple(view_from(make_camera())._replace(name=str(i), view_id=i) for i in range(6))
     scene = Scene("hand", views, (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(3), 1.0)
-    pace = Pace(cooling_from=1000, last_step=1600, is_pruning=True)
+    pace = Pace(cooling_from=1000, last_step=1650, is_pruning=True)
     state = TrainState(
         model, zero_moments(model), step=1000, view_order=[1], rng=np.random.default_rng(0), stats={}, shared={},
         shared_adam=zero_moments({}), pace=pace,
@@ -60,18 +68,26 @@ def setting(monkeypatch):
 # When -----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("length", "every"), [(610, 48), (612, 48), (613, 49), (250, 20), (262, 20), (263, 21)])
+@pytest.mark.parametrize(("length", "every"), [(650, 32), (670, 32), (671, 33), (406, 20), (426, 20), (427, 21)])
 def test_the_gap_is_rounded_down_and_twenty_at_least(length, every):
-    """0.64 of 610, 612, 613, 250, 262 and 263 in eight are 48.8, 48.96, 49.04, 20, 20.96 and 21.04."""
+    """0.64 of 650, 670, 671, 406, 426 and 427 in thirteen are 32, 32.98, 33.03, 19.99, 20.97 and 21.02."""
     pace = Pace(cooling_from=1000, last_step=1000 + length)
     assert [step for step in range(1001, 1000 + length) if slice_due(pace, step) is not None][1] == 1001 + every
 
 
-@pytest.mark.parametrize(("length", "n"), [(125, 5), (124, 4)])
+@pytest.mark.parametrize(("length", "n"), [(250, 4), (249, 3), (125, 0), (650, 8)])
 def test_a_slice_may_come_at_the_end_of_its_part_and_not_after_it(length, n):
-    """Slices come 0, 20, 40, 60 and 80 iterations after the first; 0.64 of 125 is 80, of 124 it is 79.4."""
+    """Moments come 0, 20, 40, ... iterations after the first, five unpruned; 0.64 of 250 is 160, of 249 it is 159.4."""
     pace = Pace(cooling_from=1000, last_step=1000 + length)
-    assert sum(slice_due(pace, step) is not None for step in range(1001, 1200)) == n
+    due = [slice_due(pace, step) for step in range(1001, 1650)]
+    assert [number for number in due if number is not None and number >= 0] == list(range(n))
+    assert [number for number in due if number is not None and number < 0] == [-5, -4, -3, -2, -1]
+
+
+@pytest.mark.parametrize("length", [124, 125])
+def test_the_prune_is_done_where_nothing_may_come(length):
+    """0.64 of 125 is 80, of 124 it is 79.4."""
+    pace = Pace(cooling_from=1000, last_step=1000 + length)
     assert [is_prune_done(pace, 1001 + since) for since in (79, 80, 81)] == [False, length == 124, True]
     assert not is_prune_done(Pace(), 1081)
 
@@ -116,11 +132,19 @@ def test_what_fewer_than_two_views_see_goes_before_the_first_slice_alone(setting
     assert decision.why == "3 of 200 Gaussians are visible in fewer than 2 views"
 
 
-@pytest.mark.parametrize("step", [1000, 1002, 1048, 1050, 1385])
+@pytest.mark.parametrize("step", [1000, 1002, 1192, 1194, 1417])
 def test_between_slices_nothing_goes(setting, step):
     state, run = setting
     assert len(run(step, changes=[0.5] * 10)) == N
-    assert state.pace.before_slices == () and state.pace.is_pruning
+    assert state.pace.while_cooling == () and state.pace.is_pruning
+
+
+def test_before_the_first_slice_held_out_views_are_measured_and_nothing_goes(setting):
+    state, run = setting
+    for step in UNPRUNED:
+        assert len(run(step, changes=[0.5] * 10)) == N
+    assert [m.step for m in state.pace.while_cooling] == list(UNPRUNED) and state.pace.is_pruning
+    assert len(run(FIRST, changes=[0.5] * 10)) == 190
 
 
 def test_nothing_goes_where_no_prune_is_on(setting):
@@ -135,10 +159,10 @@ def test_nothing_goes_where_no_prune_is_on(setting):
 @pytest.mark.parametrize(
     ("psnr", "ssim", "limits", "goes_on"),
     [
-        (19.5, 0.5, (1.5, 0.0), True),
+        (19.5, 0.5, (1.51, 0.01), True),
         (19.5, 0.5, (1.49, 9.0), False),
-        (21.0, 0.5, (0.0, 0.0), True),
-        (20.0, 0.25, (0.0, 0.75), True),
+        (21.0, 0.5, (0.01, 0.01), True),
+        (20.0, 0.25, (0.01, 0.76), True),
         (20.0, 0.25, (9.0, 0.74), False),
     ],
 )
@@ -146,19 +170,71 @@ def test_a_slice_is_made_if_it_may_cost_just_what_is_allowed(setting, psnr, ssim
     """From 20 dB to 19.5 it cost 0.5, and the next is assumed to cost 1 more; from 0.5 to 0.25 of SSIM, 0.75."""
     state, run = setting
     limited = {"max_psnr_cost": limits[0], "max_ssim_cost": limits[1]}
+    for step in UNPRUNED:
+        run(step)
     assert len(run(FIRST, changes=[0.5] * 10, **limited)) == 190
     assert len(run(SECOND, changes=[0.5] * 10, psnr=psnr, ssim=ssim, **limited)) == (180 if goes_on else 190)
-    assert state.pace.is_pruning == goes_on and len(state.pace.before_slices) == 2
+    assert state.pace.is_pruning == goes_on and len(state.pace.while_cooling) == 7
     assert (state.view_order == []) != goes_on
     assert [d.what for d in state.pace.decisions] == ["prune", "prune" if goes_on else "prune ended"]
 
 
 def test_a_slice_that_is_left_out_is_measured_too(setting):
-    """From 20.5 dB, the best, to 20.3 it cost 0.2, and the next may cost 0.4; at 20.3 again, 0.2 in all."""
+    """From 20.5 dB to 20.3 it cost 0.2, and the next may cost 0.4; at 20.3 again, 0.2 in all."""
     state, run = setting
-    run(FIRST, psnr=20.4)
-    run(SECOND, psnr=20.5)
-    run(1097, psnr=20.3, max_psnr_cost=0.61)
+    for step in (*UNPRUNED, FIRST, SECOND):
+        run(step, psnr=20.5)
+    run(THIRD, psnr=20.3, max_psnr_cost=0.61)
     assert state.pace.is_pruning
-    run(1145, psnr=20.3, max_psnr_cost=0.19)
+    run(FOURTH, psnr=20.3, max_psnr_cost=0.19)
     assert not state.pace.is_pruning and "0.20 ± 0.00 dB and 0.0000 ± 0.0000 of SSIM" in state.pace.decisions[-1].why
+
+
+RATES = [1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.05]  # at five measurements before the prune, the first slice and the second
+
+
+def of_errors(errors, dissimilarities):
+    """Measurements of two views that agree."""
+    psnrs = -10 * np.log10(errors)
+    return [
+        Measurement(k, (p, p), 10, 0, (1 - d, 1 - d))
+        for k, (p, d) in enumerate(zip(psnrs, dissimilarities, strict=True))
+    ]
+
+
+def test_falling_rates_do_not_hide_what_a_slice_costs():
+    """The error is 0.01 + 0.1 r; after the first slice, 0.1 dB more. The PSNR rises by 1.15 dB, and 0.3 will be lost.
+
+    1 - SSIM is 0.2 + 0.1 r, and then 0.002 more, of which 0.006 come.
+    """
+    errors, dissimilarities = 0.01 + 0.1 * np.array(RATES), 0.2 + 0.1 * np.array(RATES)
+    assert_allclose(foresee_costs(of_errors(errors, dissimilarities), RATES), np.zeros((2, 2)), atol=1e-9)
+    errors[6] *= 10**0.01
+    dissimilarities[6] += 0.002
+    measured = of_errors(errors, dissimilarities)
+    assert measured[6].psnr - measured[5].psnr == pytest.approx(1.15, abs=0.01)
+    assert_allclose(foresee_costs(measured, RATES), [(0.3, 0), (0.006, 0)], atol=1e-9)
+    assert foresee_costs(measured[:6], RATES[:6]) == ((0, 0), (0, 0))
+
+
+def test_held_out_views_may_lose_by_falling_rates():
+    """What is trained on is learned by heart: the error is 0.02 - 0.01 r, with or without a prune."""
+    errors = 0.02 - 0.01 * np.array(RATES)
+    assert_allclose(foresee_costs(of_errors(errors, np.full(7, 0.3)), RATES), np.zeros((2, 2)), atol=1e-9)
+
+
+def test_no_error_below_zero_is_predicted():
+    """The line of r - 0.05 would reach 0; the best one through the origin has the slope 2.05 / 2.2."""
+    errors = np.array(RATES) - 0.05
+    predicted = predict_unpruned(errors[:, None], RATES)
+    assert_allclose(predicted[:, 0], np.array(RATES) * 2.05 / 2.2, rtol=1e-6)
+
+
+def test_views_that_disagree_make_the_cost_uncertain():
+    """One view loses 0.2 dB, the other gains 0.1; with twice that to come 0.6 and -0.3: 0.15 dB, and 0.45 is its error.
+
+    The deviations from the mean are 0.45 each: the root of 2 x 0.45^2 / (2 - 1) / 2.
+    """
+    psnrs = [(20.0, 22.0)] * 6 + [(19.8, 22.1)]
+    cost, _ = foresee_costs([Measurement(k, pair, 10, 0, (0.5, 0.5)) for k, pair in enumerate(psnrs)], RATES)
+    assert_allclose(cost, (0.15, 0.45), atol=1e-9)
