@@ -52,6 +52,8 @@ def test_the_changes_of_the_repository_are_of_its_files():
     changes = read_changes(tomllib.loads(CHANGES.read_text()), [])
     assert {change.path for change in changes if not (REPO / change.path).is_file()} == set()
     assert [change for change in changes if change.old == change.new] == []
+    texts = {path: (REPO / path).read_text(encoding="utf-8") for path in {change.path for change in changes}}
+    assert [str(change) for change in changes if texts[change.path].count(change.old) != 1] == []  # no change would act
     assert len(set(changes)) == len(changes) > 300
 
 
