@@ -145,7 +145,7 @@ def render(
     stored_degree = math.isqrt(gaussians.sh_rest.shape[1] + 1) - 1
     sh_degree = stored_degree if sh_degree is None else sh_degree
     lowest, highest = np.min(sh_degree, initial=stored_degree), np.max(sh_degree, initial=0)
-    if not 0 <= lowest <= highest <= stored_degree:
+    if not (0 <= lowest and highest <= stored_degree):
         wrong = highest if lowest >= 0 else lowest
         raise InputError(f"sh_degree is {wrong}; these Gaussians store degrees 0 to {stored_degree}")
     background = np.zeros(3, dtype) if background is None else np.asarray(background, dtype)

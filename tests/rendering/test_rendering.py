@@ -162,6 +162,14 @@ def test_no_gaussians_render_the_background(backend, dtype):
     assert not gradient.cam_from_world_R.any() and not gradient.cam_from_world_t.any()
 
 
+def test_no_gaussians_have_degrees_of_their_own(backend):
+    """A training may have removed all; their degrees are an array without elements."""
+    none, no_degrees = empty_gaussians(), np.zeros(0, np.int32)
+    output, tape = render(none, make_camera(), background=BACKGROUND, sh_degree=no_degrees, backend=backend)
+    assert_array_equal(output.image, np.broadcast_to(BACKGROUND, (18, 24, 3)))
+    assert_allclose(render_vjp(tape, np.ones_like(output.image)).background, 18 * 24)
+
+
 def test_gaussians_behind_the_camera_render_the_background(backend, rng):
     gaussians = make_gaussians(rng, 10)
     gaussians.means[:, 2] *= -1
@@ -183,7 +191,7 @@ def test_extreme_parameters_stay_finite(backend, rng):
     assert all(np.isfinite(field).all() for field in gradient.gaussians)
 
 
-@pytest.mark.parametrize("sh_degree", [-1, 2])
+@pytest.mark.parametrize("sh_degree", [-1, 2, np.array([-1, 1]), np.array([0, 2])])
 def test_degree_that_is_not_stored(sh_degree, rng):
     with pytest.raises(InputError, match="store degrees 0 to 1"):
         render(make_gaussians(rng, 2, sh_degree=1), make_camera(), sh_degree=sh_degree)
