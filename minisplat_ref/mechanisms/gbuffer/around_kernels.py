@@ -12,7 +12,8 @@ from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cpu.gaussian_rows import contiguous
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.mechanisms.gbuffer.around import AroundGradient, Coefficients, Sight
-from minisplat_ref.mechanisms.gbuffer.formulas import dot, load_triple, store_triple, turn, turn_back
+from minisplat_ref.mechanisms.gbuffer.formulas import load_triple, store_triple, turn, turn_back
+from minisplat_ref.scalar.projection import dot
 from minisplat_ref.scalar.spherical_harmonics import basis_1, basis_1_vjp, basis_2, basis_2_vjp, basis_3, basis_3_vjp
 from minisplat_ref.types import Floats
 

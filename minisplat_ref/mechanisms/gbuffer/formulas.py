@@ -13,15 +13,10 @@ with the share f of a map. All arithmetic is float64, and an index is within its
 import math
 
 from minisplat_ref.jit.compile import scalar
+from minisplat_ref.scalar.projection import dot
 from minisplat_ref.scalar.spherical_harmonics import basis_1, basis_1_vjp, basis_2, basis_2_vjp
 
 FIRST, HEIGHT, WIDTH = 0, 1, 2  # columns of the table of maps: the first texel, and the number of rows and columns
-
-
-@scalar
-def dot(a, b):
-    """Return a.b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @scalar

@@ -10,10 +10,11 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import contiguous
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.mechanisms.gbuffer.formulas import dot, load_triple, store_triple, turn, turn_back
+from minisplat_ref.mechanisms.gbuffer.formulas import load_triple, store_triple, turn, turn_back
 from minisplat_ref.mechanisms.gbuffer.pixels import N_MATERIAL, Blended, Points
 from minisplat_ref.mechanisms.gbuffer.shading import ShadingGradient, Surface
 from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.scalar.projection import dot
 from minisplat_ref.types import Camera, Floats, Ints
 
 N_CHUNKS = 32

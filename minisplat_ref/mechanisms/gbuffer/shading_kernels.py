@@ -16,7 +16,6 @@ from minisplat_ref.mechanisms.gbuffer.brdf import table
 from minisplat_ref.mechanisms.gbuffer.formulas import (
     angles_of,
     angles_vjp,
-    dot,
     find_knot,
     find_place,
     irradiate,
@@ -33,6 +32,7 @@ from minisplat_ref.mechanisms.gbuffer.formulas import (
 )
 from minisplat_ref.mechanisms.gbuffer.prefilter import KNOTS, Filtered
 from minisplat_ref.mechanisms.gbuffer.shading import DIELECTRIC, Around, ShadingGradient, Surface
+from minisplat_ref.scalar.projection import dot
 from minisplat_ref.types import Floats, Ints
 
 N_CHUNKS = 32

@@ -146,8 +146,8 @@ COST_RISE = 2.0
 """Assumed cost of a slice, as a multiple of the one before: each slice removes more important Gaussians. With 1,
 the last slice of the room cost 0.24 dB (L)."""
 N_UNPRUNED = 5
-"""Measurements while the rates fall before the first slice, by which what it costs is told from what the rates gain
-(S)."""
+"""Measurements before the first slice, while the rates fall, which predict what held-out views would have without a
+prune (S)."""
 N_SLICES = 8
 """Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
 eight."""

@@ -165,7 +165,7 @@ def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
         r, factor of the means' rate at each moment.
     """
     terms = np.stack([np.ones(len(rates)), np.asarray(rates)], axis=1)  # [S, 2]
-    bounds = [0.0, -np.inf], np.inf  # of a and b: views that learn what is not in others lose by falling rates
+    bounds = [0.0, -np.inf], np.inf  # of a and b, which is negative where held-out views lose while the rates fall
     fits = [lsq_linear(terms[:N_UNPRUNED], of_view[:N_UNPRUNED], bounds).x for of_view in errors.T]
     return terms @ np.transpose(fits)
 
