@@ -94,7 +94,7 @@ def run_training(training: Training) -> Outcome:
     with saving_on_error(folder, recipe, state):
         run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
         run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.take_fingerprint(scene))
-        begins = checkpoints.read_step(folder) is None
+        begins = not checkpoints.read_step(folder)  # none, or the one of step 0, after which a run may be killed
         if begins:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from minisplat_ref.app.cli import main
-from minisplat_ref.app.runs import events
+from minisplat_ref.app.runs import checkpoints, events
 from minisplat_ref.app.runs.events import count_published_times, describe, mechanisms, never_fired
 from minisplat_ref.app.runs.progress import Progress, read_log
 from minisplat_ref.errors import InputError
@@ -101,6 +101,23 @@ def test_interrupted_and_resumed(run_folder, scene_folder, tmp_path, monkeypatch
     path = tmp_path / "run" / "events.jsonl"
     assert without_times(tmp_path / "run") == without_times(run_folder)[:5]
     events.append(path, 13, [FiredEvent("lost", 1, 2, 0.5)])
+    assert main(["train", "--resume", str(tmp_path / "run")]) == 0
+    assert without_times(tmp_path / "run") == without_times(run_folder)
+
+
+def test_stopped_before_anything_fired(run_folder, scene_folder, tmp_path, monkeypatch):
+    """A worker was killed after the checkpoint of step 0, and the run that another continued had no record."""
+    save = checkpoints.save
+
+    def save_and_stop(*arguments):
+        save(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(RECIPES, "3dgs", RECIPE)
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save", save_and_stop)
+        assert train(scene_folder, tmp_path / "run") == 130
+    assert checkpoints.read_step(tmp_path / "run") == 0 and not (tmp_path / "run" / "events.jsonl").exists()
     assert main(["train", "--resume", str(tmp_path / "run")]) == 0
     assert without_times(tmp_path / "run") == without_times(run_folder)
 
