@@ -92,7 +92,8 @@ def _rows() -> dict[str, Row]:
         if recipe.startswith("3dgs"):
             rows[f"lego-first-8-{recipe}"] = Row("lego", tuple(options), 22.48, EIGHT, FIRST)
     for recipe in ("3dgs-accel", "mini-splatting2", "adaptive"):
-        rows[f"fern-{recipe}"] = Row("fern", ("--recipe", recipe), 25.17, NERF)
+        length = ("--iterations", str(LENGTHS[recipe])) if recipe in LENGTHS else ()
+        rows[f"fern-{recipe}"] = Row("fern", ("--recipe", recipe, *length), 25.17, NERF)
     for recipe in ("3dgs-accel", "mini-splatting2"):
         few = ("--recipe", recipe, "--downscale", "2", "--iterations", "6000", "--test-every", "2")
         rows[f"fern-3-{recipe}"] = Row("fern", few, None, "", THREE)
