@@ -27,6 +27,7 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, select
 from minisplat_ref.mechanisms.rays.bvh import build
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
+from minisplat_ref.scalar.projection import cross, dot
 from minisplat_ref.types import Floats
 
 SQUARE, COSINE, OWN, CENTRE, E1, E2 = 1, 2, 3, 4, 7, 10  # columns of a record beside the opacity: r^2, cos(2 pi / n)
@@ -71,18 +72,6 @@ def build_tree(fans: Fans, conventions: Conventions) -> RayTree:
     records[:, E1:E2] = fans.spokes[ids, parts]
     records[:, E2:] = fans.spokes[ids, (parts + 1) % n_sides]
     return RayTree(records, ids.astype(np.int32), tree.boxes, tree.children, n)
-
-
-@scalar
-def cross(a, b):
-    """Return the cross product of two vectors."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@scalar
-def dot(a, b):
-    """Return the inner product of two vectors."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @scalar

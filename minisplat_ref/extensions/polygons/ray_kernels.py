@@ -7,11 +7,11 @@ rotation of ``2 pi / n``. Its triangles, eight times as many rows for an octagon
 
 import numpy as np
 
-from minisplat_ref.extensions.polygons.kernels import cross, dot
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.mechanisms.rays.tile_kernels import RayResponse
 from minisplat_ref.mechanisms.rays.traversal import OPACITY
+from minisplat_ref.scalar.projection import cross, dot
 from minisplat_ref.types import Floats
 
 N_SIDES, INNER = 1, 2  # columns of a record beside the opacity: n, and r cos(pi / n), from the centre to an edge

@@ -77,12 +77,6 @@ def plus_7(u, v):
 
 
 @scalar
-def dot_3(u, v):
-    """Return ``u . v``."""
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-@scalar
 def dot_5(u, v):
     """Return ``u . v``."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2] + u[3] * v[3] + u[4] * v[4]
@@ -92,9 +86,3 @@ def dot_5(u, v):
 def dot_7(u, v):
     """Return ``u . v``."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2] + u[3] * v[3] + u[4] * v[4] + u[5] * v[5] + u[6] * v[6]
-
-
-@scalar
-def cross(u, v):
-    """Return ``u x v``."""
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]

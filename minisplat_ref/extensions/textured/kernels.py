@@ -16,8 +16,6 @@ from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import CONIC_GRADIENTS, MEAN_X, OPACITY, KernelResponse, conic_response
 from minisplat_ref.extensions.textured.formulas import (
-    cross,
-    dot_3,
     dot_5,
     dot_7,
     load_3,
@@ -38,6 +36,7 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.mechanisms.payload.footprints import boxes_of
+from minisplat_ref.scalar.projection import cross, dot
 from minisplat_ref.scalar.spherical_harmonics import basis_1, basis_1_vjp, basis_2, basis_2_vjp, basis_3, basis_3_vjp
 from minisplat_ref.types import Floats
 
@@ -63,13 +62,13 @@ def make_textured_response(exp: Callable, constants: tuple) -> KernelResponse:
         along = plus_3(times_3(dx, row_3(records, n, D_X)), times_3(dy, row_3(records, n, D_Y)))
         b = plus_3(row_3(records, n, A), along)
         c = plus_3(times_3(dx, row_3(records, n, C_X)), times_3(dy, row_3(records, n, C_Y)))
-        inverse = ONE / dot_3(b, b)
+        inverse = ONE / dot(b, b)
         return b, times_3(inverse, cross(c, b)), inverse, c
 
     @scalar
     def direction(b, q, inverse):
         """Return n, the unit vector u along b, g and ``1 / l^2``."""
-        h = dot_3(q, q)
+        h = dot(q, q)
         g, u = sqrt(maximum(ONE - h, limb_squared)), times_3(sqrt(inverse), b)
         shrink = ONE / maximum(h + limb_squared, ONE)
         return times_3(sqrt(shrink), plus_3(q, times_3(-g, u))), u, g, shrink
@@ -77,7 +76,7 @@ def make_textured_response(exp: Callable, constants: tuple) -> KernelResponse:
     @scalar
     def texture(table, n, k, Y1, Y2, Y3):
         """Return the sum of the harmonics with the 15 coefficients of row n from column k on."""
-        return dot_3(row_3(table, n, k), Y1) + dot_5(row_5(table, n, k + 3), Y2) + dot_7(row_7(table, n, k + 8), Y3)
+        return dot(row_3(table, n, k), Y1) + dot_5(row_5(table, n, k + 3), Y2) + dot_7(row_7(table, n, k + 8), Y3)
 
     @scalar
     def hit(records, n, x, y):
@@ -109,14 +108,14 @@ def make_textured_response(exp: Callable, constants: tuple) -> KernelResponse:
 
         v_r = times_3(sqrt(shrink), v_n)
         v_u = times_3(-g, v_r)
-        is_round = ONE - dot_3(q, q) > limb_squared
-        v_h = HALF * select(is_round, dot_3(u, v_r) / g, -shrink * dot_3(v, v_n))
+        is_round = ONE - dot(q, q) > limb_squared
+        v_h = HALF * select(is_round, dot(u, v_r) / g, -shrink * dot(v, v_n))
         v_q = plus_3(v_r, times_3(TWO * v_h, q))
         v_c = times_3(inverse, cross(b, v_q))
-        v_b = times_3(inverse, plus_3(cross(v_q, c), times_3(-TWO * dot_3(q, v_q), b)))
-        v_b = plus_3(v_b, times_3(sqrt(inverse), plus_3(v_u, times_3(-dot_3(u, v_u), u))))
-        v_shift_x = -dot_3(row_3(records, n, D_X), v_b) - dot_3(row_3(records, n, C_X), v_c)
-        v_shift_y = -dot_3(row_3(records, n, D_Y), v_b) - dot_3(row_3(records, n, C_Y), v_c)
+        v_b = times_3(inverse, plus_3(cross(v_q, c), times_3(-TWO * dot(q, v_q), b)))
+        v_b = plus_3(v_b, times_3(sqrt(inverse), plus_3(v_u, times_3(-dot(u, v_u), u))))
+        v_shift_x = -dot(row_3(records, n, D_X), v_b) - dot(row_3(records, n, C_X), v_c)
+        v_shift_y = -dot(row_3(records, n, D_Y), v_b) - dot(row_3(records, n, C_Y), v_c)
         v_texture = (v_x,) + times_3(v_x, Y1) + times_5(v_x, Y2) + times_7(v_x, Y3)  # noqa: RUF005
         v_ray = v_b + times_3(dx, v_b) + times_3(dy, v_b) + times_3(dx, v_c) + times_3(dy, v_c)
         return v_flat + v_texture + v_ray + (v_shift_x, v_shift_y)

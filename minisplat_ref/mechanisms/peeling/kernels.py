@@ -37,6 +37,7 @@ from minisplat_ref.mechanisms.peeling.layers import (
     TranslucentMesh,
     gradient_of,
 )
+from minisplat_ref.scalar.projection import cross, dot
 from minisplat_ref.types import Floats, Ints
 
 G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the slopes along x and y, per pixel
@@ -131,18 +132,6 @@ def vertex(vertices, faces, n, i):
 def minus(a, b):
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-@scalar
-def cross(a, b):
-    """Return a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@scalar
-def dot(a, b):
-    """Return a . b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @scalar
