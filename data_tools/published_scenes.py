@@ -92,8 +92,9 @@ def _rows() -> dict[str, Row]:
         if recipe.startswith("3dgs"):
             rows[f"lego-first-8-{recipe}"] = Row("lego", tuple(options), 22.48, EIGHT, FIRST)
     for recipe in ("3dgs-accel", "mini-splatting2", "adaptive"):
-        length = ("--iterations", str(LENGTHS[recipe])) if recipe in LENGTHS else ()
-        rows[f"fern-{recipe}"] = Row("fern", ("--recipe", recipe, *length), 25.17, NERF)
+        options = ["--recipe", recipe]
+        options += ["--iterations", str(LENGTHS[recipe])] if recipe in LENGTHS else []
+        rows[f"fern-{recipe}"] = Row("fern", tuple(options), 25.17, NERF)
     for recipe in ("3dgs-accel", "mini-splatting2"):
         few = ("--recipe", recipe, "--downscale", "2", "--iterations", "6000", "--test-every", "2")
         rows[f"fern-3-{recipe}"] = Row("fern", few, None, "", THREE)
@@ -124,14 +125,15 @@ def measure(name: str, data: Path, out: Path, part: int = 1) -> list[str]:
     options = shortened(row.options, part)
     if not (out / "metrics.json").is_file() and minisplat_ref(["train", str(scene), *options, "--out", str(out)]):
         raise InputError(f"{name}: the training has failed")
-    return cells(name, json.loads((out / "metrics.json").read_text(encoding="utf-8")))
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    return cells(name, metrics, row.published if tuple(options) == row.options else None)
 
 
-def cells(name: str, metrics: dict[str, float]) -> list[str]:
-    """Return the cells of a row, by the metrics of its run."""
-    row, psnr = ROWS[name], metrics["psnr"]
-    published = "-" if row.published is None else f"{row.published:.2f}"
-    difference = "-" if row.published is None else f"{psnr - row.published:+.2f}"
+def cells(name: str, metrics: dict[str, float], reference: float | None) -> list[str]:
+    """Return the cells of a row, by the metrics of its run and the figure published for its length, if there is one."""
+    psnr = metrics["psnr"]
+    published = "-" if reference is None else f"{reference:.2f}"
+    difference = "-" if reference is None else f"{psnr - reference:+.2f}"
     seconds = f"{metrics['train_cpu_seconds']:,.0f}"
     n_gaussians, iterations = f"{metrics['n_gaussians']:,}", f"{metrics['iterations']:,}"
     return [name, iterations, published, f"{psnr:.2f}", difference, f"{metrics['ssim']:.4f}", n_gaussians, seconds]
@@ -149,8 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--part", type=integer(1), default=1, metavar="N", help="1 / N of the iterations (default all)")
     args = parser.parse_args(arguments)
     if args.row is None:
-        for name, row in ROWS.items():
-            print(f"{name:<24}data {row.data_set}, train {' '.join(row.options)}")
+        for name, listed in ROWS.items():
+            print(f"{name:<24}data {listed.data_set}, train {' '.join(listed.options)}")
         return 0
     if args.data is None or args.out is None:
         parser.error(f"{args.row} needs --data DIR and --out RUN")
@@ -160,8 +162,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"published_scenes: error: {error}", file=sys.stderr)
         return 2
     print(f"{describe_machine()}\n\n{markdown_table(HEADING, [found])}")
-    if ROWS[args.row].source:
-        print(f"\npublished: {ROWS[args.row].source}")
+    row = ROWS[args.row]
+    if row.published is not None:
+        print(f"\npublished, for all iterations: {row.published:.2f} dB, {row.source}")
     return 0
 
 

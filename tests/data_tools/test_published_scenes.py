@@ -1,6 +1,7 @@
 """Rows of published scenes: which images remain of Lego, the cells by hand, and a row that is trained."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -91,8 +92,8 @@ def test_a_fern_without_its_photographs_is_refused(tmp_path):
 def test_cells_by_hand():
     metrics = {"psnr": 35.0, "ssim": 0.98, "n_gaussians": 300_000, "iterations": 30_000, "train_cpu_seconds": 5400.4}
     expected = ["lego-3dgs", "30,000", "35.78", "35.00", "-0.78", "0.9800", "300,000", "5,400"]
-    assert cells("lego-3dgs", metrics) == expected
-    assert cells("lego-adaptive", metrics)[2:5] == ["-", "35.00", "-"]
+    assert cells("lego-3dgs", metrics, 35.78) == expected
+    assert cells("lego-adaptive", metrics, None)[2:5] == ["-", "35.00", "-"]
 
 
 def test_a_part_of_the_iterations():
@@ -108,7 +109,11 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     command = ["lego-first-8-3dgs-accel", "--data", str(lego), "--out", str(tmp_path / "run")]
     assert main(command) == 0
     printed = capsys.readouterr().out
-    assert "| lego-first-8-3dgs-accel | 2" in printed and "published: issue 40 of Fictionarry/DNGaussian" in printed
+    assert "| lego-first-8-3dgs-accel | 2" in printed
+    assert "published, for all iterations: 22.48 dB, issue 40 of Fictionarry/DNGaussian" in printed
+    assert re.search(r"\| 2 +\| 22\.48 ", printed)
+    assert main([*command[:-1], str(tmp_path / "half"), "--part", "2"]) == 0
+    assert re.search(r"\| 1 +\| - ", capsys.readouterr().out)  # what is published is of all iterations
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     assert main(["lego-8-3dgs", "--data", str(tmp_path / "no"), "--out", str(tmp_path / "b" / "run")]) == 2
