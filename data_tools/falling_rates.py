@@ -4,7 +4,7 @@ A run in which nothing is removed meanwhile is made by ``minisplat-ref train SCE
 --set min_views=0 --set max_psnr_cost=9 --set max_ssim_cost=1 --out RUN``. ``python -m data_tools.falling_rates RUN
 [RUN ...]`` then prints, for each of the moments at which a slice could be removed, the factor of the means' rate, the
 PSNR of the held-out views, and what :func:`minisplat_ref.methods.adaptive.prune.predict_unpruned` predicts from the
-first N_UNPRUNED of them. In a run that was pruned, the difference is what that cost.
+first N_FITTED of them. In a run that was pruned, the difference is what that cost.
 """
 
 import argparse
@@ -16,8 +16,7 @@ import numpy as np
 from minisplat_ref.app.runs import run_folder
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.reporting import markdown_table
-from minisplat_ref.methods.adaptive.numbers import N_UNPRUNED
-from minisplat_ref.methods.adaptive.prune import predict_unpruned
+from minisplat_ref.methods.adaptive.prune import N_FITTED, predict_unpruned
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.training.pace import pace_from_json
 
@@ -35,10 +34,8 @@ def rows_of(folder: Path) -> list[list[str]]:
         raise InputError(f"{file} is missing: give the --out folder of a training of adaptive that has ended")
     pace = pace_from_json(run_folder.read_json_object(file))
     measured = pace.while_cooling
-    if len(measured) <= N_UNPRUNED or ADAPTIVE.cooling is None:
-        raise InputError(
-            f"{folder} was measured {len(measured)} times while its rates fell: {N_UNPRUNED + 1} are needed"
-        )
+    if len(measured) <= N_FITTED or ADAPTIVE.cooling is None:
+        raise InputError(f"{folder} was measured {len(measured)} times while its rates fell: {N_FITTED + 1} are needed")
     rates = [ADAPTIVE.cooling.factors(m.step, pace)[1] for m in measured]
     predicted = predict_unpruned(10.0 ** (-np.array([m.psnrs for m in measured]) / 10.0), rates)
     psnrs = (-10.0 * np.log10(predicted)).mean(axis=1)

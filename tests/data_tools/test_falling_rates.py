@@ -34,5 +34,5 @@ def test_moments_by_hand(tmp_path, capsys):
 def test_runs_that_have_none(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
     assert "decisions.json is missing" in capsys.readouterr().err
-    assert main([write_run(tmp_path / "early", {}, n=5)]) == 2
-    assert "was measured 5 times while its rates fell: 6 are needed" in capsys.readouterr().err
+    assert main([write_run(tmp_path / "early", {}, n=6)]) == 2
+    assert "was measured 6 times while its rates fell: 7 are needed" in capsys.readouterr().err

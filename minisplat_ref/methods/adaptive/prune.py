@@ -8,7 +8,7 @@ repairs what it can, and the changes are recomputed.
 The cost is measured, too, on the training views that are held out. Meanwhile their error falls because the rates do,
 which hides what the slices cost; so a line predicts what the error would be without them. The squared error of a view
 is ``a + b r``, where r is the factor of the means' rate: what the model cannot show, and what comes of steps that are
-too long. Both are fitted to N_UNPRUNED measurements before the first slice; so are those of 1 - SSIM. When the next
+too long. Both are fitted to N_FITTED measurements before the first slice; so are those of 1 - SSIM. When the next
 slice would cost more than a tenth of a decibel, or five thousandths of SSIM, in all, the prune ends. To let the prune
 go on within the standard error of this cost was tried: two views agree or disagree by chance, and on ten photographs
 it removed Gaussians that held-out ones needed (N). The prune also ends where no further slice is due: at the end of the
@@ -31,6 +31,8 @@ from minisplat_ref.strategy.removal import collect_removal_costs, select_worthwh
 from minisplat_ref.training.pace import Decision, Measurement, Pace
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Floats
+
+N_FITTED = N_UNPRUNED + 1  # measurements without a prune: the last one is made directly before the first slice
 
 
 def slice_due(pace: Pace, step: int) -> int | None:
@@ -135,7 +137,7 @@ class Cost(NamedTuple):
 def foresee_costs(measurements: Sequence[Measurement], rates: Sequence[float]) -> tuple[Cost, Cost]:
     """Return the estimated cost of the prune after one more slice: PSNR in dB, and SSIM.
 
-    The cost so far is the value that the first N_UNPRUNED measurements predict, less the present one; one more slice is
+    The cost so far is the value that the first N_FITTED measurements predict, less the present one; one more slice is
     assumed to cost ``COST_RISE`` times as much as the last one, unless the views have gained by that. Before the first
     slice both are 0.
 
@@ -146,7 +148,7 @@ def foresee_costs(measurements: Sequence[Measurement], rates: Sequence[float]) -
     rates : sequence of float
         Factor of the means' rate at each.
     """
-    if len(measurements) <= N_UNPRUNED + 1:
+    if len(measurements) <= N_FITTED:
         return Cost(0.0, 0.0), Cost(0.0, 0.0)
     errors = 10.0 ** (-np.array([m.psnrs for m in measurements]) / 10.0)
     dissimilarities = 1.0 - np.array([m.ssims for m in measurements])
@@ -155,7 +157,7 @@ def foresee_costs(measurements: Sequence[Measurement], rates: Sequence[float]) -
 
 
 def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
-    """Return the errors [S, V] without a prune: a + b r with a >= 0, fitted to the first N_UNPRUNED of each view.
+    """Return the errors [S, V] without a prune: a + b r with a >= 0, fitted to the first N_FITTED of each view.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
     """
     terms = np.stack([np.ones(len(rates)), np.asarray(rates)], axis=1)  # [S, 2]
     bounds = [0.0, -np.inf], np.inf  # of a and b, which is negative where held-out views lose while the rates fall
-    fits = [lsq_linear(terms[:N_UNPRUNED], of_view[:N_UNPRUNED], bounds).x for of_view in errors.T]
+    fits = [lsq_linear(terms[:N_FITTED], of_view[:N_FITTED], bounds).x for of_view in errors.T]
     return terms @ np.transpose(fits)
 
 

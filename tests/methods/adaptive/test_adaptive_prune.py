@@ -224,10 +224,13 @@ def test_held_out_views_may_lose_by_falling_rates():
 
 
 def test_no_error_below_zero_is_predicted():
-    """The line of r - 0.05 would reach 0; the best one through the origin has the slope 2.05 / 2.2."""
-    errors = np.array(RATES) - 0.05
+    """The line of r - 0.05 would reach 0; the best one through the origin has the slope 2.055 / 2.21.
+
+    The sixth measurement counts, directly before the first slice, and the seventh does not, after it.
+    """
+    errors = np.array([*RATES[:6], 7.0]) - 0.05
     predicted = predict_unpruned(errors[:, None], RATES)
-    assert_allclose(predicted[:, 0], np.array(RATES) * 2.05 / 2.2, rtol=1e-6)
+    assert_allclose(predicted[:, 0], np.array(RATES) * 2.055 / 2.21, rtol=1e-6)
 
 
 def test_views_that_disagree_make_the_cost_uncertain():
