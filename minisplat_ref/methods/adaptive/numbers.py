@@ -142,9 +142,6 @@ PRUNED_MAX = 0.2
 """Fraction of the Gaussians in a slice, at most. No reason recorded."""
 PSNR_COST_MAX, SSIM_COST_MAX = 0.1, 0.005
 """dB and SSIM that the prune may cost on held-out training views, in all slices together (L)."""
-COST_RISE = 2.0
-"""Assumed cost of a slice, as a multiple of the one before: each slice removes more important Gaussians. With 1,
-the last slice of the room cost 0.24 dB (L)."""
 N_UNPRUNED = 5
 """Measurements before the first slice, while the rates fall, which predict what held-out views would have without a
 prune (S)."""

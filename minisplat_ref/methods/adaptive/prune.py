@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.methods.adaptive.numbers import COST_RISE, GAP_MIN, LAST_SLICE, N_SLICES, N_UNPRUNED, SLICE_MIN
+from minisplat_ref.methods.adaptive.numbers import GAP_MIN, LAST_SLICE, N_SLICES, N_UNPRUNED, SLICE_MIN
 from minisplat_ref.methods.adaptive.progress import evaluate_held_out
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
@@ -138,8 +138,7 @@ def foresee_costs(measurements: Sequence[Measurement], rates: Sequence[float]) -
     """Return the estimated cost of the prune after one more slice: PSNR in dB, and SSIM.
 
     The cost so far is the value that the first N_FITTED measurements predict, less the present one; one more slice is
-    assumed to cost ``COST_RISE`` times as much as the last one, unless the views have gained by that. Before the first
-    slice both are 0.
+    assumed to cost as much as the last one, unless the views have gained by that. Before the first slice both are 0.
 
     Parameters
     ----------
@@ -175,7 +174,7 @@ def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
 def _foresee(costs: Floats) -> Cost:
     """Return the cost of one more slice by the costs [S, V] at the moments so far, of each view."""
     last = costs[-1] - costs[-2]
-    lost = costs[-1] + (COST_RISE * last if last.mean() > 0 else 0.0)
+    lost = costs[-1] + (last if last.mean() > 0 else 0.0)
     return Cost(float(lost.mean()), float(lost.std(ddof=1) / np.sqrt(len(lost))))
 
 
