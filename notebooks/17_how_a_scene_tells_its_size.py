@@ -230,8 +230,8 @@ for name, (psnrs, counts) in around.items():
 # the relative change $1 / N$ of the count. After each slice the others learn to replace what is gone. What that costs
 # is measured on the held-out views. Meanwhile they gain by the falling rates, so the measurements before the first
 # slice predict what they would have without a prune: a squared error of $a + b r$, with the factor $r$ of the means'
-# rate. The prune ends when one more slice, taken to cost twice what the last one did, would take 0.1 dB or 0.005 of
-# SSIM from them in all, as the log above says. The right panel and the lines below it show the test views, which
+# rate. The prune ends when one more slice, taken to cost what the last one did, would take 0.1 dB or 0.005 of SSIM
+# from them in all, as the log above says. The right panel and the lines below it show the test views, which
 # nothing has used, before the cool-down, after the prune and at the end.
 #
 # ## The gains of photographs
