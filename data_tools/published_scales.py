@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.claims import kit
 from minisplat_ref.app.runs.opened_run import Run, open_run
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
-from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
-from minisplat_ref.metrics import psnr
+from minisplat_ref.mechanisms.sampling import zoom_camera
 from minisplat_ref.types import view_from
 
 SIDES = (1, 2, 4, 8)  # pixels of the photograph along the side of a pixel of the image
@@ -38,11 +38,10 @@ def measure(run: Run) -> list[float]:
         photograph = view.load()
         if min(photograph.camera.width, photograph.camera.height) < SIDES[-1]:
             raise InputError(f"test view {view.name} of {run.folder} has no pixel left at 1/{SIDES[-1]} of its size")
-        truth = photograph.image.astype(np.float64) / 255
         cameras = [zoom_camera(photograph.camera, 1 / n) for n in SIDES]
         images = [run.render_settings.render_view(run.model, view_from(camera))[0].image for camera in cameras]
         pairs = zip(images, SIDES, strict=True)
-        found.append([psnr(np.clip(image, 0, 1), block_means(truth, n)) for image, n in pairs])
+        found.append([kit.psnr_of(image, kit.photograph_at(photograph, n)) for image, n in pairs])
     return [float(mean) for mean in np.mean(found, axis=0)]
 
 

@@ -19,7 +19,7 @@ from minisplat_ref.extensions.antialiasing.model import apply_filters, with_2d_f
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.interface.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.interface.reporting import markdown_table
-from minisplat_ref.mechanisms.sampling import block_means, shrink_photographs, zoom_camera
+from minisplat_ref.mechanisms.sampling import shrink_photographs, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.compensation import compensation, with_compensation
@@ -91,11 +91,10 @@ def blocks(scene: Scene, downscale: int) -> list[int]:
 def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:
     """Return the mean PSNR of the test views, dB, for each size of block."""
     views = [view.load() for view in scene.test_views]
-    return [float(np.mean([kit.psnr_of(found.render_at(v, 1 / n), _photograph(v, n)) for v in views])) for n in sides]
-
-
-def _photograph(view: View, n: int) -> Floats:
-    return block_means(view.load().image.astype(float) / 255, n)
+    return [
+        float(np.mean([kit.psnr_of(found.render_at(view, 1 / n), kit.photograph_at(view, n)) for view in views]))
+        for n in sides
+    ]
 
 
 class Measured(NamedTuple):
@@ -117,7 +116,7 @@ def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measur
     psnr: dict[str, list[list[float]]] = {}
     counts: dict[str, list[int]] = {name: [] for name in COLORS}
     view = scene.test_views[0]
-    images = {"photograph": _photograph(view, sides[-1])}
+    images = {"photograph": kit.photograph_at(view, sides[-1])}
     for seed in range(seeds):
         for name in kit.with_progress(COLORS, f"trainings, seed {seed}"):
             found = train_arm(name, small, iterations, seed)

@@ -20,7 +20,7 @@ from minisplat_ref.extensions.multi_scale.model import LEVELS, Plan, add_levels,
 from minisplat_ref.extensions.multi_scale.recipe import COVERAGE_MIN, finest_densities
 from minisplat_ref.interface.palette import BLUE, BROWN, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
 from minisplat_ref.interface.reporting import markdown_table
-from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
+from minisplat_ref.mechanisms.sampling import zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.recipe_settings import configure
@@ -93,8 +93,9 @@ def figures(variant: Variant, scene: Scene, n: int) -> Figures:
     rows = []
     for i, view in enumerate(scene.test_views):
         output = render_reduced(variant, scene, i, n)
-        target = block_means(view.load().image.astype(float) / 255, n)
-        rows.append((kit.psnr_of(output.image, target), output.n_pairs, output.stats.hit_count.sum()))
+        rows.append(
+            (kit.psnr_of(output.image, kit.photograph_at(view, n)), output.n_pairs, output.stats.hit_count.sum())
+        )
     return Figures(*(float(value) for value in np.mean(rows, axis=0)))
 
 
@@ -117,7 +118,7 @@ def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     found: dict[str, list[list[Figures]]] = {name: [] for name in COLORS}
     counts: dict[str, list[int]] = {name: [] for name in COLORS}
     shown = min(4, blocks[-1])
-    images = {"photograph": block_means(scene.test_views[0].load().image.astype(float) / 255, shown)}
+    images = {"photograph": kit.photograph_at(scene.test_views[0], shown)}
     for seed in range(seeds):
         for name, variant in kit.with_progress(variants(scene, iterations, seed).items(), f"measuring, seed {seed}"):
             found[name].append([figures(variant, scene, n) for n in blocks])

@@ -31,10 +31,11 @@ from minisplat_ref.interface.progress import with_progress as with_progress  # w
 from minisplat_ref.interface.reporting import describe_machine
 from minisplat_ref.io import load_ply, viewpoints
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.mechanisms.sampling import block_means
 from minisplat_ref.training.fine_tuning import drop_events as drop_events
 from minisplat_ref.training.fine_tuning import fine_tune as fine_tune
 from minisplat_ref.training.representation import count_floats as count_floats
-from minisplat_ref.types import NOTHING, Camera, Floats, Gaussians, Scene
+from minisplat_ref.types import NOTHING, Camera, Floats, Gaussians, Scene, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -247,6 +248,11 @@ def read_run(ply: Path) -> tuple[Gaussians, Camera]:
 def psnr_of(image: Floats, target: Floats) -> float:
     """Return the PSNR of an image clipped to [0, 1], dB."""
     return float(-10 * np.log10(np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2)))
+
+
+def photograph_at(view: View, n: int) -> Floats:
+    """Return a photograph at 1/n of its size, [H / n, W / n, 3] in [0, 1]: the means of its blocks of n x n pixels."""
+    return block_means(view.load().image.astype(np.float64) / 255, n)
 
 
 def angles(found: Floats, truth: Floats) -> Floats:
