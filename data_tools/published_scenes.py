@@ -151,8 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--part", type=integer(1), default=1, metavar="N", help="1 / N of the iterations (default all)")
     args = parser.parse_args(arguments)
     if args.row is None:
-        for name, listed in ROWS.items():
-            print(f"{name:<24}data {listed.data_set}, train {' '.join(listed.options)}")
+        for name, row in ROWS.items():
+            print(f"{name:<24}data {row.data_set}, train {' '.join(row.options)}")
         return 0
     if args.data is None or args.out is None:
         parser.error(f"{args.row} needs --data DIR and --out RUN")

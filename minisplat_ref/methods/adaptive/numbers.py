@@ -143,8 +143,8 @@ PRUNED_MAX = 0.2
 PSNR_COST_MAX, SSIM_COST_MAX = 0.1, 0.005
 """dB and SSIM that the prune may cost on held-out training views, in all slices together (L)."""
 N_UNPRUNED = 5
-"""Measurements before the first slice, while the rates fall, which predict what held-out views would have without a
-prune (S)."""
+"""Moments before that of the first slice at which held-out views are measured, while the rates fall, to predict what
+they would have without a prune (S)."""
 N_SLICES = 8
 """Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
 eight."""
