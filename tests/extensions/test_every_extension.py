@@ -5,6 +5,7 @@ NAME``: along random directions, without Jacobians, of half the Gaussians, with 
 against the reference by the tests of each extension.
 """
 
+import numba
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -20,7 +21,7 @@ from minisplat_ref.oracle.pieces import SEED
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR, GRADIENT_REL_NEAR_THRESHOLD
 from minisplat_ref.rendering import Request
-from minisplat_ref.rendering.backends import REFERENCE
+from minisplat_ref.rendering.backends import CPU, REFERENCE
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.types import Frame, Model
@@ -152,3 +153,28 @@ def test_a_scene_is_drawn_alike_wherever_it_lies(name):
     seen_from = view._replace(camera=place_camera(view.camera, FRAME))
     image = representation.renderer.render(moved, seen_from, drawing.request)[0].image
     assert_allclose(image, drawing.image, atol=PARITY_FLOAT64)
+
+
+# Threads
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+@pytest.mark.parametrize("name", sorted(EXTENSIONS.keys() - WITHOUT))
+def test_bytes_do_not_depend_on_threads(name):
+    """The kernels' renderer and stages with their gradients, over 30 tiles; in float32 rounding would hide an order."""
+    extension, rng = EXTENSIONS[name], np.random.default_rng(SEED)
+    representation = None if extension.representation is GAUSSIANS else extension.representation
+    setting = make_setting(rng, 300, 90, 70, GSPLAT_MAIN, sh_degree=3)
+    for stage in model_stages(CPU, setting, representation, extension.stages, rng):
+        arrays = list(stage.inputs.values())
+        v = [rng.normal(size=np.shape(value)) for value in stage.function(*arrays).outputs]
+        results, n_threads = [], numba.get_num_threads()
+        try:
+            for n in (1, 2, 2):
+                numba.set_num_threads(n)
+                results.append([*stage.function(*arrays).outputs, *stage.vjp(*v)])
+        finally:
+            numba.set_num_threads(n_threads)
+        assert sum(np.any(array) for array in results[0]) > 1, stage.name
+        for one, *two in zip(*results, strict=True):
+            assert all(np.asarray(one).tobytes() == np.asarray(other).tobytes() for other in two), stage.name
