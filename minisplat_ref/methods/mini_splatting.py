@@ -71,7 +71,10 @@ def candidates(stats: ImportanceStats, metric: ImportanceMetric, min_views: int,
         importance = simplification.intersection_preserving(importance, stats.dominant_count)
     importance = np.where(visibility.find_seen_by_few(stats.is_visible, min_views), 0.0, importance)
     if not importance.any():
-        raise InputError("no Gaussian matters to any training view: check that the cameras look at the scene's points")
+        raise InputError(
+            "no Gaussian matters to any training view: check that the cameras look at the scene's points, and that"
+            " masks are white where the scene counts"
+        )
     return importance
 
 
