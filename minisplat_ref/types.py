@@ -9,7 +9,7 @@ right and y down, and the centre of the top-left pixel is (0.5, 0.5).
 
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -19,6 +19,7 @@ from minisplat_ref.interface.showing import as_bytes, one_line, to_png, to_sheet
 Floats = NDArray[np.floating]
 Ints = NDArray[np.integer]
 Bools = NDArray[np.bool_]
+Item = TypeVar("Item")  # of a list
 
 
 class Gaussians(NamedTuple):
@@ -140,10 +141,10 @@ def number_views(views: Iterable[View]) -> tuple[View, ...]:
     return tuple(view._replace(view_id=i) for i, view in enumerate(views))
 
 
-def some_views(views: Sequence[View], n: int) -> list[View]:
-    """Return at most ``n`` of the views, spread evenly over the list from the first to the last."""
-    rows = np.linspace(0, len(views) - 1, min(len(views), n)).round().astype(int)
-    return [views[row] for row in rows]
+def some_of(items: Sequence[Item], n: int) -> list[Item]:
+    """Return at most ``n`` of the items, spread evenly over the list from the first to the last."""
+    rows = np.linspace(0, len(items) - 1, min(len(items), n)).round().astype(int)
+    return [items[row] for row in rows]
 
 
 def view_from(camera: Camera, *, name: str = "", time: float = 0.0) -> View:

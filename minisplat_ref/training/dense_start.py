@@ -21,7 +21,7 @@ from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.strategy.line_of_sight import MARGIN
 from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes
-from minisplat_ref.types import Bools, Floats, Ints, Scene, View
+from minisplat_ref.types import Bools, Floats, Ints, Scene, View, some_of
 
 LONG_SIDE = 144
 """Pixels, of the small photographs: a sweep takes a quarter of a second."""
@@ -70,7 +70,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
         World frame; the sparse points first.
     colors : ndarray of shape (P, 3), uint8
     """
-    views = scene.train_views[:: -(-len(scene.train_views) // VIEWS_MAX)]
+    views = some_of(scene.train_views, VIEWS_MAX)
     smalls = [_shrink(view.load(), *_depth_range(view, scene)) for view in views]
     neighbours = choose_neighbours(views, scene.points)
     jobs = list(zip(smalls, neighbours, strict=True))

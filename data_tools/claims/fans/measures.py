@@ -23,7 +23,7 @@ from minisplat_ref.extensions.fans.model import (
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.schedule import scale_recipe
-from minisplat_ref.types import Gaussians, Model, Scene, View, some_views
+from minisplat_ref.types import Gaussians, Model, Scene, View, some_of
 
 REACHES, RIMS = (2.0, 2.5, 3.0, 3.5), (0.0, 0.1, 0.2)
 SIDES = (3, 4, 6, 8, 12, 16)
@@ -42,7 +42,7 @@ class Judge(NamedTuple):
 
 def judge_of(scene: Scene) -> Judge:
     """Return the scene with a few of its training views, spread evenly."""
-    return Judge(scene, [view.load() for view in some_views(scene.train_views, VIEWS_MAX)])
+    return Judge(scene, [view.load() for view in some_of(scene.train_views, VIEWS_MAX)])
 
 
 def shape_rows(gaussians: Gaussians, judge: Judge, shape: FanShape) -> list[dict[str, Any]]:

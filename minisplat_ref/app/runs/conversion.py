@@ -26,7 +26,7 @@ from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
-from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Ints, Model, number_views, some_views
+from minisplat_ref.types import FILE_FRAME, Frame, Gaussians, Ints, Model, number_views, some_of
 
 VIEWS_MAX = 24
 OUTLIER_REACH = 1000.0  # extents of most of a scene; a sky of Gaussians is less than a hundred away
@@ -356,7 +356,7 @@ def make_judge(source: Source, path: Path, scene: Path | None, downscale: int | 
         photographs = place_scene(load_scene(scene, downscale=downscale or 1, undistort=True), source.frame)
     else:
         raise InputError(f"--max-drop needs photographs to measure on, and {path} is no run: give --scene PATH")
-    views = some_views(photographs.train_views, VIEWS_MAX)
+    views = some_of(photographs.train_views, VIEWS_MAX)
 
     def measure_psnr(gaussians: Gaussians) -> float:
         psnr = evaluate(

@@ -28,7 +28,7 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.formats.sog import SOG
 from minisplat_ref.io.other_places import SOG_LEVELS
 from minisplat_ref.strategy.ops import concat, n_rows, take
-from minisplat_ref.types import Bools, Floats, Gaussians, Model, some_views
+from minisplat_ref.types import Bools, Floats, Gaussians, Model, some_of
 
 N_LEVELS = 4  # ours, as are the next two
 SMALLEST = 64  # Gaussians: a level of fewer shows nothing
@@ -133,7 +133,7 @@ def _to_files(run: Run, population: Gaussians) -> Gaussians:
 
 def _measure(run: Run, decoded: Sequence[Sequence[Gaussians]]) -> list[float]:
     """Return what each level loses on at most ``VIEWS_MAX`` training views, dB."""
-    chosen = some_views(run.scene.train_views, VIEWS_MAX)
+    chosen = some_of(run.scene.train_views, VIEWS_MAX)
 
     def psnr(model: Model) -> float:
         return float(np.mean([view.psnr for view in evaluate_views(run, model, chosen)]))

@@ -14,7 +14,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.io.stored_views import StoredView, make_room
 from minisplat_ref.rendering.backends import REFERENCE, Backend
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Camera, Scene, some_views
+from minisplat_ref.types import Camera, Scene, some_of
 
 N_VIEWS, N_SAMPLED = 4, 5000
 
@@ -33,7 +33,7 @@ def foresee(scene: Scene, state: TrainState, conventions: Conventions, backend: 
     backend : Backend
     """
     views = scene.train_views
-    cameras = [view.camera for view in some_views(views, N_VIEWS)]
+    cameras = [view.camera for view in some_of(views, N_VIEWS)]
     n_pixels = max(view.camera.width * view.camera.height for view in views)
     files = [view.photograph.n_pixels for view in (*views, *scene.test_views) if isinstance(view, StoredView)]
     needs = memory.Needs(

@@ -1,7 +1,5 @@
 """Growth of ``adaptive``: Gaussians whose screen gradient is large are halved, those behind most of the error first."""
 
-import math
-
 import numpy as np
 
 from minisplat_ref.methods.gaussian_splatting import collect_gradients
@@ -10,7 +8,7 @@ from minisplat_ref.strategy.halving import halves
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.pace import trained_ids
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Floats, some_of
 
 
 def collect_while_growing(state: TrainState, iteration: Iteration) -> None:
@@ -69,5 +67,5 @@ def _error_weights(state: TrainState, iteration: Iteration, max_views: int) -> F
     """Return the error that each Gaussian [N] is responsible for, in at most this many training views."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
-    chosen = [views[index] for index in ids[:: math.ceil(len(ids) / max_views)]]
+    chosen = [views[index] for index in some_of(ids, max_views)]
     return collect_error_weights(state.model, chosen, iteration.render_settings)

@@ -40,7 +40,7 @@ from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.pace import trained_ids
 from minisplat_ref.training.sky import N_BASIS, SKY, unit_rays
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Bools, Floats, Ints
+from minisplat_ref.types import Bools, Floats, Ints, some_of
 
 
 class Behind(NamedTuple):
@@ -153,8 +153,7 @@ def examine_sky(state: TrainState, iteration: Iteration) -> Answer | str:
     n = int(np.count_nonzero(large))
     if n == 0:
         return "no Gaussian is large"
-    ids = trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace)
-    ids = ids[:: -(-len(ids) // SKY_VIEWS_MAX)]
+    ids = some_of(trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace), SKY_VIEWS_MAX)
     pixels = open_pixels(state, iteration, ids, ~large)
     if len(pixels) < SKY_VIEWS_MIN:
         return f"{len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
