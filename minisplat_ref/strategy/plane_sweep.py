@@ -10,12 +10,13 @@ brightness changes:
 
     zncc = (E[a b] - E[a] E[b]) / sqrt(Var[a] Var[b])        E, Var over W
 
-The planes are evenly spaced in 1/d. The score of a plane is the mean over the better half of the neighbours, because
-in the others something may hide it; the depth is that of the best plane, refined by the parabola through it and
-the planes beside it. A depth counts where the correlation is high, and where a neighbour's own depth agrees
-(:func:`are_confirmed`). Left out: slanted planes, and any smoothness between pixels.
+The planes are evenly spaced in 1/d, a pixel and a half of a neighbour apart. The score of a plane is the mean over the
+better half of the neighbours, because in the others something may hide it; the depth is that of the best plane, refined
+by the parabola through it and the planes beside it. A depth counts where the correlation is high, and where a
+neighbour's own depth agrees (:func:`are_confirmed`). Left out: slanted planes, and any smoothness between pixels.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -37,6 +38,11 @@ CONTRAST_MIN = 0.01
 """Standard deviation of the brightness in W, out of 1, below which a pixel has no depth: 2.5 levels of 255."""
 AGREEMENT = 0.02
 """Of the depth; a neighbour's depth that differs by less confirms a point."""
+PIXELS_BETWEEN = 1.5
+"""Pixels from one plane to the next, in the median over the pixels and the neighbours: less than a third of W, so that
+no peak of the correlation is missed."""
+PLANES_MIN, PLANES_MAX = 48, 192
+"""Planes, whatever the neighbours. With 192 a sweep takes half a second."""
 VARIANCE_PRODUCT_MIN = 1e-10
 """Guards the division where a window is uniform; the contrast rules these pixels out."""
 
@@ -97,6 +103,29 @@ def sweep_planes(view: GrayView, others: Sequence[GrayView], inverse_depths: Flo
     return DepthMap(np.where(counts, 1.0 / inverse, 0.0), np.where(counts, highest, 0.0))
 
 
+def choose_planes(camera: Camera, others: Sequence[Camera], near: float, far: float) -> Floats:
+    """Return 1/d of the planes [D] to sweep between two depths, evenly spaced, ascending.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the photograph.
+    others : sequence of Camera
+        Of its neighbours.
+    near, far : float
+        Camera z, world units.
+    """
+    moves = [np.zeros(0)]
+    for other in others:
+        rays = relative_rays(camera, other)
+        (u, v, at_far), (u_near, v_near, at_near) = (meet_plane(rays, other, 1 / depth) for depth in (far, near))
+        move = np.hypot(u_near - u, v_near - v)
+        moves.append(move[at_far & at_near & np.isfinite(move)])
+    pixels = np.concatenate(moves)
+    n = math.ceil(np.median(pixels) / PIXELS_BETWEEN) + 1 if len(pixels) else PLANES_MAX
+    return np.linspace(1 / far, 1 / near, min(max(n, PLANES_MIN), PLANES_MAX))
+
+
 class PlaneRays(NamedTuple):
     """The rays of a camera's pixels in the frame of another: a plane at depth d is met at ``directions + t / d``."""
 
@@ -113,6 +142,18 @@ def relative_rays(camera: Camera, other: Camera) -> PlaneRays:
     xs, ys = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     directions = np.moveaxis(pinhole_rays(xs, ys, camera) @ R.T, -1, 0)
     return PlaneRays(np.ascontiguousarray(directions, np.float32), t.astype(np.float32))
+
+
+def meet_plane(rays: PlaneRays, other: Camera, inverse_depth: float) -> tuple[Floats, Floats, Bools]:
+    """Return where a neighbour's image has the points at which rays meet a plane, u and v [H, W], pixels.
+
+    The third array says which of them are in front of the neighbour; where others are has no meaning.
+    """
+    x, y, z = (d + np.float32(shift * inverse_depth) for d, shift in zip(rays.directions, rays.t, strict=True))
+    is_before = z > 0
+    z = np.where(is_before, z, np.float32(1))
+    u = np.float32(other.fx) * x / z + np.float32(other.cx)
+    return u, np.float32(other.fy) * y / z + np.float32(other.cy), is_before
 
 
 def warp(rays: PlaneRays, other: GrayView, inverse_depth: float) -> tuple[Floats, Bools]:
@@ -134,10 +175,7 @@ def warp(rays: PlaneRays, other: GrayView, inverse_depth: float) -> tuple[Floats
         Where the neighbour shows the plane, and half a window around it.
     """
     camera = other.camera
-    x, y, z = (d + np.float32(shift * inverse_depth) for d, shift in zip(rays.directions, rays.t, strict=True))
-    is_inside = z > 0
-    z = np.where(is_inside, z, np.float32(1))
-    u, v = np.float32(camera.fx) * x / z + np.float32(camera.cx), np.float32(camera.fy) * y / z + np.float32(camera.cy)
+    u, v, is_inside = meet_plane(rays, camera, inverse_depth)
     is_inside &= (u >= HALF) & (v >= HALF) & (u <= camera.width - HALF) & (v <= camera.height - HALF)
     half = np.float32(0.5)
     return map_coordinates(other.gray, [v - half, u - half], order=1, mode="nearest"), is_inside

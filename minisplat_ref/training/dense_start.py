@@ -20,13 +20,18 @@ from minisplat_ref.io.images import resize_image, resize_mask
 from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.strategy.line_of_sight import MARGIN
-from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes
+from minisplat_ref.strategy.plane_sweep import (
+    DepthMap,
+    GrayView,
+    are_confirmed,
+    choose_planes,
+    surface_points,
+    sweep_planes,
+)
 from minisplat_ref.types import Bools, Floats, Ints, Scene, View, some_of
 
 LONG_SIDE = 144
-"""Pixels, of the small photographs: a sweep takes a quarter of a second."""
-N_PLANES = 48
-"""Depths that are compared. No reason recorded."""
+"""Pixels, of the small photographs: a sweep takes half a second."""
 N_NEIGHBOURS = 4
 """Photographs that each is compared with, at most. No reason recorded."""
 VIEWS_MAX = 32
@@ -43,8 +48,10 @@ different."""
 POINTS_MIN = 8
 """Minimum number of sparse points of a photograph from which its depths are taken; with fewer, all in its image
 count."""
-DEPTH_MARGINS = (0.7, 2.0)
-"""Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept."""
+DEPTH_MARGINS = (0.35, 2.0)
+"""Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept. The
+ground before a photographer is three times nearer than the house whose points it is; what is nearer than all planes is
+found at a wrong depth."""
 EXTENT_DEPTHS = (0.3, 20.0)
 """In units of the scene's extent: depths that are swept where a view has no points."""
 
@@ -53,7 +60,8 @@ class _Small(NamedTuple):
     gray_view: GrayView
     rgb: NDArray[np.uint8]  # [h, w, 3]
     mask: Bools | None  # [h, w]
-    inverse_depths: Floats  # [D]
+    near: float  # depths between which planes are swept, world units
+    far: float
 
 
 def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
@@ -192,9 +200,7 @@ def _shrink(view: View, near: float, far: float) -> _Small:
     rgb = resize_image(view.image, width, height)
     mask = None if view.mask is None else resize_mask(view.mask, width, height)
     gray = rgb.mean(axis=2, dtype=np.float32) / np.float32(255.0)
-    return _Small(
-        GrayView(rescale_camera(camera, width, height), gray), rgb, mask, np.linspace(1 / far, 1 / near, N_PLANES)
-    )
+    return _Small(GrayView(rescale_camera(camera, width, height), gray), rgb, mask, near, far)
 
 
 def _depth_range(view: View, scene: Scene) -> tuple[float, float]:
@@ -218,7 +224,8 @@ def _sweep(small: _Small, others: Sequence[GrayView]) -> DepthMap:
     if not others:
         nothing = np.zeros(small.gray_view.gray.shape)
         return DepthMap(nothing, nothing)
-    found = sweep_planes(small.gray_view, others, small.inverse_depths)
+    planes = choose_planes(small.gray_view.camera, [other.camera for other in others], small.near, small.far)
+    found = sweep_planes(small.gray_view, others, planes)
     return found if small.mask is None else DepthMap(*(np.where(small.mask, field, 0.0) for field in found))
 
 

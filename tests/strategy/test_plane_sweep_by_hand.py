@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from minisplat_ref.strategy import plane_sweep
-from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, relative_rays, sweep_planes
+from minisplat_ref.strategy.plane_sweep import (
+    DepthMap,
+    GrayView,
+    are_confirmed,
+    choose_planes,
+    relative_rays,
+    sweep_planes,
+)
 from minisplat_ref.types import Camera
 from scenes import make_camera
 
@@ -112,3 +119,36 @@ def test_rays_in_the_frame_of_another_by_hand():
     assert rays.directions.shape == (3, 2, 4) and rays.directions.dtype == rays.t.dtype == np.float32
     np.testing.assert_allclose(rays.directions[:, 0, 3], [-1, 0.75, 0.5], atol=1e-7)
     np.testing.assert_allclose(rays.t, [3, -1, 6], atol=1e-7)
+
+
+# How many planes ------------------------------------------------------------------------------------------------------
+
+
+def at(x=0.0, y=0.0, z=0.0):
+    """The camera at another place, looking the same way."""
+    return CAMERA._replace(cam_from_world_t=-np.array([x, y, z]))
+
+
+@pytest.mark.parametrize(
+    ("others", "n"),
+    [
+        ([at(x=4)], 73),  # 30 x 4 x (1 - 1 / 10) = 108 pixels, 72 steps
+        ([at(y=4)], 69),  # 28 x 4 x 0.9 = 100.8, 68 steps
+        ([at(x=4), at(x=1), at(x=40)], 73),  # the middle one of three
+        ([at(x=4), at(z=20)], 73),  # one that has the scene behind it does not count
+        ([at(x=0.1)], 48),
+        ([at(x=40)], 192),
+        ([at(z=20)], 192),
+    ],
+)
+def test_a_pixel_and_a_half_from_plane_to_plane(others, n):
+    planes = choose_planes(CAMERA, others, 1.0, 10.0)
+    np.testing.assert_allclose(planes, np.linspace(0.1, 1.0, n), rtol=1e-12)
+
+
+def test_a_step_forward_moves_what_is_not_in_the_middle():
+    """From 0.5 nearer, a pixel r from the middle is at r d / (d - 0.5): for r = 7, 14.0 and 7.4 at depths 1 and 10."""
+    wide = make_camera(1201, 1)._replace(fx=300.0, fy=300.0)
+    ahead = wide._replace(cam_from_world_t=np.array([0, 0, -0.5]))
+    moves = np.abs(np.arange(1201) - 600) * (2 - 10 / 9.5)
+    assert len(choose_planes(wide, [ahead], 1.0, 10.0)) == np.ceil(np.median(moves) / 1.5) + 1
