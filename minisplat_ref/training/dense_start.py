@@ -48,10 +48,10 @@ different."""
 POINTS_MIN = 8
 """Minimum number of sparse points of a photograph from which its depths are taken; with fewer, all in its image
 count."""
-DEPTH_MARGINS = (0.35, 2.0)
+DEPTH_MARGINS = (0.5, 2.0)
 """Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept. The
-ground before a photographer is three times nearer than the house whose points it is; what is nearer than all planes is
-found at a wrong depth."""
+ground before a photographer is nearer than the house that has the points, and what is nearer than all planes is found
+at a wrong depth; nearer than half of the way there is nothing (:mod:`minisplat_ref.strategy.camera_clearance`)."""
 EXTENT_DEPTHS = (0.3, 20.0)
 """In units of the scene's extent: depths that are swept where a view has no points."""
 

@@ -68,16 +68,16 @@ def test_the_longer_side_becomes_144_pixels(sweeps, size, small):
     np.testing.assert_allclose(view.gray, 70 / 255, rtol=1e-6)
 
 
-def test_depths_between_a_third_of_the_nearest_and_twice_the_farthest_hundredth(sweeps):
-    """Of the depths 1 to 101 the first percentile is 2, the last 100: planes from 1 / 200 to 1 / 0.7.
+def test_depths_between_half_of_the_nearest_and_twice_the_farthest_hundredth(sweeps):
+    """Of the depths 1 to 101 the first percentile is 2, the last 100: planes from 1 / 200 to 1.
 
-    The neighbour is 2 to the side: 30 x 2 x (1 / 0.7 - 1 / 200) = 85.4 pixels, 57 steps of a pixel and a half.
+    The neighbour is 3 to the side: 30 x 3 x (1 - 1 / 200) = 89.55 pixels, 60 steps of a pixel and a half.
     """
     points = np.column_stack([np.zeros((101, 2)), np.arange(1.0, 102)])
-    densify_points(scene_of([photographed(moved(make_camera(), x), range(101)) for x in (0, 2)], points))
+    densify_points(scene_of([photographed(moved(make_camera(), x), range(101)) for x in (0, 3)], points))
     found = sweeps[0][0][2]
-    assert len(found) == 58
-    np.testing.assert_allclose(found, 1 / 200 + np.arange(58) / 57 * (1 / 0.7 - 1 / 200), rtol=1e-12)
+    assert len(found) == 61
+    np.testing.assert_allclose(found, 1 / 200 + np.arange(61) / 60 * (1 - 1 / 200), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("n_track", "far"), [(8, 20.0), (7, 75.2)])
@@ -85,7 +85,7 @@ def test_of_less_than_eight_points_all_in_the_image_count(sweeps, n_track, far):
     """Eight at depth 10 and one at 40, whose last percentile is 10 + 0.92 x 30 = 37.6: the 8.92th of nine."""
     points = np.concatenate([AT_TEN[:8], [[0.0, 0, 40]]])
     densify_points(scene_of([photographed(moved(make_camera(), x), range(n_track)) for x in (0, 1)], points))
-    np.testing.assert_allclose(1 / sweeps[0][0][2][[-1, 0]], [3.5, far], rtol=1e-12)
+    np.testing.assert_allclose(1 / sweeps[0][0][2][[-1, 0]], [5.0, far], rtol=1e-12)
 
 
 def test_without_points_three_tenths_to_twenty_extents(sweeps):

@@ -151,12 +151,15 @@ def foresee_costs(measurements: Sequence[Measurement], rates: Sequence[float]) -
         return Cost(0.0, 0.0), Cost(0.0, 0.0)
     errors = 10.0 ** (-np.array([m.psnrs for m in measurements]) / 10.0)
     dissimilarities = 1.0 - np.array([m.ssims for m in measurements])
-    psnr_costs = 10.0 * np.log10(errors / predict_unpruned(errors, rates))
-    return _foresee(psnr_costs), _foresee(dissimilarities - predict_unpruned(dissimilarities, rates))
+    psnr_costs = 10.0 * np.log10(errors[-2:] / predict_unpruned(errors, rates)[-2:])
+    return _foresee(psnr_costs), _foresee((dissimilarities - predict_unpruned(dissimilarities, rates))[-2:])
 
 
 def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
     """Return the errors [S, V] without a prune: a + b r with a >= 0, fitted to the first N_FITTED of each view.
+
+    Rates fall, so from the last fitted moment on the line is above 0: where b is negative it rises, and elsewhere a and
+    b are not. Before that it may be below 0.
 
     Parameters
     ----------
@@ -172,7 +175,7 @@ def predict_unpruned(errors: Floats, rates: Sequence[float]) -> Floats:
 
 
 def _foresee(costs: Floats) -> Cost:
-    """Return the cost of one more slice by the costs [S, V] at the moments so far, of each view."""
+    """Return the cost of one more slice by the costs [2, V] at the last two moments, of each view."""
     last = costs[-1] - costs[-2]
     lost = costs[-1] + (last if last.mean() > 0 else 0.0)
     return Cost(float(lost.mean()), float(lost.std(ddof=1) / np.sqrt(len(lost))))

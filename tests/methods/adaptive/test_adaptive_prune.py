@@ -233,6 +233,16 @@ def test_no_error_below_zero_is_predicted():
     assert_allclose(predicted[:, 0], np.array(RATES) * 2.055 / 2.21, rtol=1e-6)
 
 
+def test_a_line_that_begins_below_zero():
+    """Nearly all of the error comes at the sixth moment. What the line has at the first is of no account."""
+    errors = np.array([1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 0.05, 0.05])
+    line = np.polyval(np.polyfit(RATES[:6], errors[:6], 1), RATES)
+    assert line[0] < 0 < line[5]
+    (cost, error), _ = foresee_costs(of_errors(errors, np.full(7, 0.3)), RATES)
+    assert_allclose((cost, error), (10 * np.log10(0.05 / line[6]), 0), rtol=1e-6)
+    assert cost < 10 * np.log10(0.05 / line[5])
+
+
 def test_views_that_disagree_make_the_cost_uncertain():
     """One view loses 0.2 dB, the other gains 0.1; with as much to come 0.4 and -0.2: 0.1 dB, and 0.3 is its error.
 
