@@ -92,8 +92,8 @@ panels["psnr"].legend()
 plt.show()
 
 # %% [markdown]
-# The bare room ends with half the Gaussians, at a PSNR that is over 5 dB higher. It has grown to half as many as the other,
-# because on bare walls gradients soon are small; then the prune takes a third of both, more or less, what the
+# The bare room ends with half the Gaussians, at a PSNR that is over 5 dB higher. It has grown to half as many as the
+# other, because on bare walls gradients soon are small; then the prune takes a third of both, more or less, what the
 # photographs would hardly miss, until it costs the held-out views too much. This is the log of the decisions, as the
 # state keeps it:
 
