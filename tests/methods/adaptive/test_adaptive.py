@@ -12,7 +12,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.methods.adaptive import prune
+from minisplat_ref.methods.adaptive import growth, prune
 from minisplat_ref.methods.adaptive.growth import grow
 from minisplat_ref.methods.adaptive.progress import proceed_when_little_is_gained
 from minisplat_ref.methods.adaptive.prune import GAP_MIN, N_SLICES, N_UNPRUNED, prune_in_slices, slice_due
@@ -192,6 +192,19 @@ def test_those_behind_most_error_are_halved_and_not_too_many(scene):
         assert state.stats == {}
     state.pace = state.pace._replace(cooling_from=100)
     assert "falling" in grow(state, here, max_growth=1.0, error_views=0, **settings)
+
+
+def test_the_error_is_looked_for_from_the_first_view_to_the_last(scene, monkeypatch):
+    """Three of the ten that are trained on: the first, the fifth and the tenth; every fourth would be the ninth."""
+    state = initial_state(scene, ADAPTIVE._replace(starts_densely=False), 0)
+    n, seen = len(state.gaussians.means), []
+    here = Iteration(scene, None, None, np.zeros(0, int), None, RenderSettings(scene.background), cooling=COOLING)
+    trained = trained_ids(len(scene.train_views), COOLING, state.pace)
+    assert len(trained) == 10
+    monkeypatch.setattr(growth, "collect_error_weights", lambda model, views, s: seen.extend(views) or np.zeros(n))
+    state.stats = {"gradient_sum": np.ones(n, np.float32), "view_count": np.ones(n, np.int32)}
+    grow(state, here, threshold=4e-4, max_growth=0.2, offset=0.5, error_views=3)
+    assert [view.name for view in seen] == [scene.train_views[trained[k]].name for k in (0, 4, 9)]
 
 
 def test_a_budget_is_a_ceiling(scene):
