@@ -1,8 +1,8 @@
 """How right the points of a dense start are, on scenes of known depth.
 
-``python -m data_tools.measure_stereo [SCENE ...]`` makes synthetic scenes of 12 training views of 192 x 144 pixels,
-finds points by :func:`minisplat_ref.training.dense_start.densify_points`, and prints how many of them lie more than 5 %
-of their distance from the nearest camera away from everything that a photograph shows.
+``python -m data_tools.measure_stereo [SCENE ...]`` makes synthetic scenes of 14 views of 192 x 144 pixels, of which two
+are test views, finds points by :func:`minisplat_ref.training.dense_start.densify_points`, and prints how many of them
+lie more than 5 % of their distance from the nearest camera away from everything that a photograph shows.
 """
 
 import argparse
@@ -20,13 +20,7 @@ from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.types import Floats
 
 SCENES = ("outdoor", "room", "staircase", "park-1")
-SIZE: dict[str, Any] = {
-    "n_views": 14,
-    "width": 192,
-    "height": 144,
-    "supersampling": 1,
-    "n_points": 2000,
-}  # two views of 14 are tests
+SIZE: dict[str, Any] = {"width": 192, "height": 144, "n_views": 14, "supersampling": 1, "n_points": 2000}
 TOLERANCE = 0.05
 HEADING = ("scene", "points", "off by more than 5 %", "processor seconds")
 
@@ -54,9 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m data_tools.measure_stereo", description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", default=SCENES, help="synthetic scenes with surfaces")
     names = parser.parse_args(arguments).scenes
-    print(
-        describe_machine(), "", markdown_table(HEADING, [measure(make_scene(name, **SIZE)) for name in names]), sep="\n"
-    )
+    rows = [measure(make_scene(name, **SIZE)) for name in names]
+    print(describe_machine(), "", markdown_table(HEADING, rows), sep="\n")
 
 
 if __name__ == "__main__":
