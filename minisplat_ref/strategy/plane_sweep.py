@@ -42,7 +42,7 @@ PIXELS_BETWEEN = 1.5
 """Pixels from one plane to the next, in the median over the pixels and the neighbours: less than a third of W, so that
 no peak of the correlation is missed."""
 PLANES_MIN, PLANES_MAX = 48, 192
-"""Planes, whatever the neighbours. With 192 a sweep takes half a second."""
+"""Planes, whatever the neighbours. With 192 a sweep takes half a second; no reason recorded for 48."""
 VARIANCE_PRODUCT_MIN = 1e-10
 """Guards the division where a window is uniform; the contrast rules these pixels out."""
 

@@ -35,7 +35,7 @@ LONG_SIDE = 144
 N_NEIGHBOURS = 4
 """Photographs that each is compared with, at most. No reason recorded."""
 VIEWS_MAX = 32
-"""Photographs that are compared, evenly spread, at most, so that the start takes a few seconds."""
+"""Photographs that are compared, evenly spread, at most, so that the start takes less than half a minute."""
 SPACING = 3.0
 """Pixels of the small photographs: nearer than this to another point no point is added."""
 COMPANY, REACH = 3, 4.0
@@ -51,7 +51,8 @@ count."""
 DEPTH_MARGINS = (0.5, 2.0)
 """Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept. The
 ground before a photographer is nearer than the house that has the points, and what is nearer than all planes is found
-at a wrong depth; nearer than half of the way there is nothing (:mod:`minisplat_ref.strategy.camera_clearance`)."""
+at a wrong depth; nearer than half of the way, free balls say that there is nothing
+(:mod:`minisplat_ref.strategy.camera_clearance`). Measured beside 0.7 and 0.35 (``docs/measured/adaptive.md``, U)."""
 EXTENT_DEPTHS = (0.3, 20.0)
 """In units of the scene's extent: depths that are swept where a view has no points."""
 
