@@ -151,6 +151,7 @@ def _share_axes(axes: str | None, path: Path, format_: "Format | None") -> "tupl
 
 def _write_page(args: argparse.Namespace) -> int:
     """Write the model as a page that shows it, and print how to open it."""
+    from minisplat_ref.app.runs.model_file import describe_parts, missing_parts
     from minisplat_ref.app.runs.model_source import open_source
     from minisplat_ref.app.runs.run_folder import CONFIG, scene_title
     from minisplat_ref.app.runs.settings import load
@@ -181,9 +182,12 @@ def _write_page(args: argparse.Namespace) -> int:
     )
     if cameras:
         print(describe_up(source.up))
-    parts = [*trained.model.shared, *([] if trained.renderer.name == SPLATTING.name else [trained.renderer.name])]
-    if parts:
-        print(f"minisplat-ref: the page shows plain 3DGS, without {', '.join(parts)}", file=sys.stderr)
+    lacks = [describe_parts(missing_parts(trained.model.shared))]
+    own_renderer = trained.renderer.name.partition(" with ")[0]  # calibrations append their names
+    if own_renderer != SPLATTING.name:
+        lacks.append(own_renderer)
+    if without := ", ".join(filter(None, lacks)):
+        print(f"minisplat-ref: the page shows plain 3DGS, without {without}", file=sys.stderr)
     return 0
 
 
