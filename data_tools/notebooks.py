@@ -15,6 +15,7 @@ Solutions of exercises are blocks of Python in markdown. They are run too, after
 an error of the notebook.
 """
 
+import asyncio
 import base64
 import difflib
 import hashlib
@@ -25,6 +26,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +47,7 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "notebooks"
 SECONDS_MAX = 300  # of a cell, on a busy machine that compiles its kernels
 PNG_MAX = 100_000  # bytes of an image
+AT_ONCE = min(os.cpu_count() or 1, 4)  # notebooks: each takes one core, and up to a gigabyte
 
 # Mean absolute difference of two images' values, 0 to 255: room for another version's fonts.
 IMAGE_EXACT = 1.0
@@ -96,7 +100,7 @@ def execute(text: Path) -> Notebook:
     # The matrices and images are small: threads that wait for each other cost more than they help.
     threads = {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     try:
-        client.execute(env={**os.environ, **threads, "PYTHONPATH": str(ROOT)})
+        asyncio.run(client.async_execute(env={**os.environ, **threads, "PYTHONPATH": str(ROOT)}))  # in any thread
     except CellExecutionError as error:
         is_failed = [any(out.output_type == "error" for out in cell.get("outputs", [])) for cell in notebook.cells]
         number = is_failed.index(True)
@@ -269,6 +273,18 @@ def check(text: Path) -> str:
     return "; ".join(differences(nbformat.read(text.with_suffix(".ipynb"), as_version=4), execute(text)))  # type: ignore[no-untyped-call]
 
 
+def _treat(path: Path, is_checked: bool) -> tuple[str, bool]:
+    """Store or check a notebook; return the line about it, and whether all is well."""
+    start = time.perf_counter()
+    try:
+        what = check(path) if is_checked else store(path)
+        is_good = not (is_checked and what)
+    except InputError as error:
+        what, is_good = str(error), False
+    seconds = time.perf_counter() - start
+    return one_line(f"{path.stem}: {what or 'as stored'} ({seconds:.0f} s)"), is_good
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Store or check notebooks, with one line for each; return the exit code."""
     parser = Parser(
@@ -284,17 +300,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         paths = _paths(args.names)
     except InputError as error:
         parser.error(str(error))
-    for path in paths:
-        start = time.perf_counter()
-        try:
-            what = check(path) if args.check else store(path)
-            is_good = not (args.check and what)
-        except InputError as error:
-            what, is_good = str(error), False
-        seconds = time.perf_counter() - start
-        print(one_line(f"{path.stem}: {what or 'as stored'} ({seconds:.0f} s)"), flush=True)
-        if not is_good:
-            different.append(path.stem[:2])
+    with ThreadPoolExecutor(AT_ONCE) as pool:  # each waits for a kernel, which is a process
+        for path, (line, is_good) in zip(paths, pool.map(partial(_treat, is_checked=args.check), paths), strict=True):
+            print(line, flush=True)
+            if not is_good:
+                different.append(path.stem[:2])
     if different and args.check:
         print(f"what is meant to be different is stored by: python -m data_tools.notebooks {' '.join(different)}")
     return 1 if different else 0

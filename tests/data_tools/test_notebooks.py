@@ -5,6 +5,7 @@ import base64
 import io
 import re
 import sys
+import threading
 from types import SimpleNamespace
 
 import jupytext
@@ -248,6 +249,26 @@ def test_store_then_check_then_change(folder, capsys):
     assert main(["--check"]) == 1
     shown = capsys.readouterr().out
     assert "cell 1: text differs: - 43 + 42" in shown and shown.endswith("python -m data_tools.notebooks 00\n")
+
+
+def test_several_run_at_once_and_are_named_in_order(folder, monkeypatch, capsys):
+    (folder / "01_other.py").write_text("# %%\n1\n")
+    first_ended, second_ended = threading.Event(), threading.Event()
+
+    def check(text):
+        if text.stem == "00_small":
+            assert second_ended.wait(30), "the second one waits for the first"
+            first_ended.set()
+            return ""
+        second_ended.set()
+        return "text differs"
+
+    monkeypatch.setattr(notebooks, "AT_ONCE", 2)
+    monkeypatch.setattr(notebooks, "check", check)
+    assert main(["--check"]) == 1 and first_ended.is_set()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(" (")[0] for line in lines[:2]] == ["00_small: as stored", "01_other: text differs"]
+    assert lines[2].endswith("data_tools.notebooks 01")
 
 
 def test_a_wrong_solution_is_named(folder):
