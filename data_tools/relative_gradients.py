@@ -62,7 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             without.append(name)
         else:
             rows.append(to_row(name, cases))
-    print(describe_machine(), "", markdown_table(HEADING, rows), "", f"{NOTHING} of {', '.join(without)}", sep="\n")
+    print(describe_machine(), "", markdown_table(HEADING, rows), sep="\n")
+    if without:
+        print("", f"{NOTHING} of {', '.join(without)}", sep="\n")
 
 
 if __name__ == "__main__":
