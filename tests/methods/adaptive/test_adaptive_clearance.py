@@ -21,7 +21,8 @@ from minisplat_ref.types import Gaussians
 
 PLANTED_AT, LAST = 550, 650  # veils are removed in iteration 600
 BESIDE = 1.5  # metres: cameras of the near side are nearer to a veil
-RECOVERED, LOST = 0.1, 4.0  # dB; without veils, and with veils that are removed, trainings differ by 0.01
+LOST = 3.0  # dB; with veils, six seeds on processors with and without AVX-512 lose 3.1 to 13.3 in each of the two views
+RECOVERED = 0.5  # dB; with veils that are removed, the same are between 0.2 below and 0.1 above those without
 
 
 @pytest.fixture(scope="module")
