@@ -11,7 +11,7 @@ from data_tools.claims.satellite import boxes
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.satellite import cameras
+from minisplat_ref.extensions.satellite import cameras, rpc, utm
 from minisplat_ref.extensions.satellite import model as formulas
 from minisplat_ref.extensions.satellite.model import HAS_SHADOWS, IN_SHADOW, RADIOMETRY, SATELLITE
 from minisplat_ref.extensions.satellite.recipe import (
@@ -47,20 +47,20 @@ FINE = 1e-8  # central differences of step 1e-5 on values near 1
 def test_utm_of_a_known_tower():
     """The CN Tower, 43 38 33.24 N, 79 23 13.7 W, is at 630084 E, 4833438 N of zone 17, to the metre."""
     longitude, latitude = -(79 + 23 / 60 + 13.7 / 3600), 43 + 38 / 60 + 33.24 / 3600
-    assert cameras.find_zone(longitude) == 17
-    found = cameras.utm_from_degrees(np.array([longitude]), np.array([latitude]), 17, is_south=False)
+    assert utm.find_zone(longitude) == 17
+    found = utm.utm_from_degrees(np.array([longitude]), np.array([latitude]), 17, is_south=False)
     assert np.abs(found - [630_084, 4_833_438]).max() < 1
 
 
 def test_utm_of_a_meridian():
     """On its central meridian a zone is 0.9996 times the arc, 4,984,944.378 m to 45 degrees; south begins at 10^7."""
-    found = cameras.utm_from_degrees(np.full(2, 9.0), np.array([45.0, -45.0]), 32, is_south=False)
+    found = utm.utm_from_degrees(np.full(2, 9.0), np.array([45.0, -45.0]), 32, is_south=False)
     arc = 0.9996 * 4_984_944.378
     assert np.abs(found - [[500_000, arc], [500_000, -arc]]).max() < 1e-3
-    south = cameras.utm_from_degrees(np.full(1, 9.0), np.array([-45.0]), 32, is_south=True)
+    south = utm.utm_from_degrees(np.full(1, 9.0), np.array([-45.0]), 32, is_south=True)
     assert south[0, 1] == pytest.approx(1e7 - arc, abs=1e-3)
     with pytest.raises(InputError, match="84 degrees"):
-        cameras.utm_from_degrees(np.zeros(1), np.array([85.0]), 31, is_south=False)
+        utm.utm_from_degrees(np.zeros(1), np.array([85.0]), 31, is_south=False)
 
 
 @pytest.mark.parametrize("latitude", [3.0, 30.0, 61.0, 80.0])
@@ -69,7 +69,7 @@ def test_northings_are_arcs_of_the_meridian(latitude):
     a, f = 6_378_137.0, 1 / 298.257223563
     e2 = f * (2 - f)
     arc = quad(lambda phi: a * (1 - e2) / (1 - e2 * np.sin(phi) ** 2) ** 1.5, 0, np.radians(latitude), epsrel=1e-13)[0]
-    found = cameras.utm_from_degrees(np.full(1, 9.0), np.full(1, latitude), 32, is_south=False)
+    found = utm.utm_from_degrees(np.full(1, 9.0), np.full(1, latitude), 32, is_south=False)
     assert np.abs(found - [500_000, 0.9996 * arc]).max() < 1e-6
 
 
@@ -79,7 +79,7 @@ def test_utm_agrees_with_proj(is_south):
     warp = pytest.importorskip("rasterio.warp")
     rng, code = np.random.default_rng(0), f"EPSG:{32732 if is_south else 32632}"
     longitudes, latitudes = rng.uniform(5.5, 12.5, 1000), rng.uniform(0, 84, 1000) * (-1 if is_south else 1)
-    found = cameras.utm_from_degrees(longitudes, latitudes, 32, is_south=is_south)
+    found = utm.utm_from_degrees(longitudes, latitudes, 32, is_south=is_south)
     assert np.abs(found - np.column_stack(warp.transform("EPSG:4326", code, longitudes, latitudes))).max() < 1e-6
 
 
@@ -92,7 +92,7 @@ def make_rpc(curved=0.0):
     numerators[:, 10:] += curved
     denominators[:, 1:4] += curved
     degrees = 300 / 111_320
-    return cameras.RPC(
+    return rpc.RPC(
         np.array([12.5, 41.9, 50.0]),
         np.array([degrees / np.cos(np.radians(41.9)), degrees, 100.0]),
         np.array([600.0, 600.0]),
@@ -119,7 +119,7 @@ def text_of(r, style="txt"):
         lines = [f"{name}: {float(value)!r} degrees" for name, value in flat.items()]
         lines += [f"{name}_{k}: {float(v)!r}" for name, values in lists.items() for k, v in enumerate(values, 1)]
         return "\n".join(lines)
-    back = {theirs: ours for ours, theirs in cameras._RPB_NAMES.items()}
+    back = {theirs: ours for ours, theirs in rpc._RPB_NAMES.items()}
     lines = [f"  {back[name]} = {float(value)!r};" for name, value in flat.items()]
     for name, values in lists.items():
         rows = ",\n".join(repr(float(v)) for v in values)
@@ -129,16 +129,16 @@ def text_of(r, style="txt"):
 
 def test_monomials_have_the_order_of_rpc00b():
     """Each coefficient alone, at L, P, H = 2, 3, 5, by hand."""
-    m, _ = cameras._monomials(np.array([[2.0, 3.0, 5.0]]))
+    m, _ = rpc._monomials(np.array([[2.0, 3.0, 5.0]]))
     assert m[0].tolist() == [1, 2, 3, 5, 6, 10, 15, 4, 9, 25, 30, 8, 18, 50, 12, 27, 75, 20, 45, 125]
 
 
 def test_derivatives_of_monomials():
     x, h = np.array([[0.3, -0.7, 0.4]]), 1e-6
-    _, dm = cameras._monomials(x)
+    _, dm = rpc._monomials(x)
     for k in range(3):
         step = h * np.eye(3)[k]
-        difference = (cameras._monomials(x + step)[0] - cameras._monomials(x - step)[0]) / (2 * h)
+        difference = (rpc._monomials(x + step)[0] - rpc._monomials(x - step)[0]) / (2 * h)
         assert np.abs(dm[:, k] - difference).max() < FINE
 
 
@@ -146,29 +146,29 @@ def test_projection_by_hand():
     """A scale of latitude north is 600 lines up and 60 samples right; the middle's centre is at 600.5."""
     r = make_rpc()
     ground = np.array([r.ground_offset, r.ground_offset + np.array([0, r.ground_scale[1], 0])])
-    assert np.abs(cameras.project(r, ground) - [[600.5, 600.5], [660.5, 0.5]]).max() < 1e-9
+    assert np.abs(rpc.project(r, ground) - [[600.5, 600.5], [660.5, 0.5]]).max() < 1e-9
 
 
 def test_localisation_inverts_projection():
     r = make_rpc(0.01)
     rng = np.random.default_rng(0)
     pixels, heights = rng.uniform(0, 1200, (50, 2)), rng.uniform(0, 100, 50)
-    ground = cameras.localise(r, pixels, heights)
-    assert np.abs(cameras.project(r, ground) - pixels).max() < 1e-6
+    ground = rpc.localise(r, pixels, heights)
+    assert np.abs(rpc.project(r, ground) - pixels).max() < 1e-6
     assert np.abs(ground[:, 2] - heights).max() < EXACT * 100
 
 
 def test_localisation_refuses_what_has_no_inverse():
     r = make_rpc()
     with pytest.raises(InputError, match="cannot be inverted"):
-        cameras.localise(r._replace(numerators=np.ones((2, 20))), np.array([[3.0, 5.0]]), np.zeros(1))
+        rpc.localise(r._replace(numerators=np.ones((2, 20))), np.array([[3.0, 5.0]]), np.zeros(1))
 
 
 @pytest.mark.parametrize("style", ["txt", "rpb"])
 def test_texts_are_read(tmp_path, style):
     r, image = make_rpc(0.01), tmp_path / "a.png"
     (tmp_path / ("a_RPC.TXT" if style == "txt" else "a.RPB")).write_text(text_of(r, style))
-    found = cameras.read_rpc(image)
+    found = rpc.read_rpc(image)
     assert all(np.array_equal(a, b) for a, b in zip(found, r, strict=True))
 
 
@@ -180,9 +180,9 @@ def test_bad_texts_are_refused(tmp_path):
         (text.replace("LAT_SCALE: ", "LAT_SCALE: 0 # "), "scale of the RPC is 0"),
     ):
         with pytest.raises(InputError, match=message):
-            cameras.parse_rpc(bad, tmp_path / "x_RPC.TXT")
+            rpc.parse_rpc(bad, tmp_path / "x_RPC.TXT")
     with pytest.raises(InputError, match=r"no RPC; put b_RPC\.TXT beside it"):
-        cameras.read_rpc(tmp_path / "b.png")
+        rpc.read_rpc(tmp_path / "b.png")
 
 
 # --- the affine fit ---
@@ -217,7 +217,7 @@ def test_a_pixel_is_the_limit_of_a_fit():
 
 def test_a_low_sun_shines():
     """A degree above the horizon it does, 0.03 degrees count as none."""
-    low, set_ = (cameras.sun_direction(10, elevation, 0) for elevation in (1, 0.03))
+    low, set_ = (utm.sun_direction(10, elevation, 0) for elevation in (1, 0.03))
     assert sun_slopes(cameras.make_affine_camera(NORTH_UP, np.zeros(2), 1.0, (4, 4), low))[2] == pytest.approx(1)
     with pytest.raises(InputError, match="horizon"):
         cameras.make_affine_camera(NORTH_UP, np.zeros(2), 1.0, (4, 4), set_)
@@ -225,7 +225,7 @@ def test_a_low_sun_shines():
 
 @pytest.mark.parametrize(("longitude", "zone"), [(-180, 1), (-174.1, 1), (-174, 2), (0, 31), (179.9, 60), (180, 1)])
 def test_zones(longitude, zone):
-    assert cameras.find_zone(longitude) == zone
+    assert utm.find_zone(longitude) == zone
 
 
 def test_fit_of_an_rpc():
@@ -235,8 +235,8 @@ def test_fit_of_an_rpc():
     assert (frame.zone, frame.is_south) == (33, False)
     fit = cameras.fit_rpc(r, frame, (1200, 1200), (0.0, 100.0), "a")
     assert fit.worst < 0.04
-    ground = cameras.localise(r, np.array([[100.0, 900.0]]), np.array([80.0]))
-    place = cameras.utm_from_degrees(ground[:, 0], ground[:, 1], frame.zone, is_south=False)
+    ground = rpc.localise(r, np.array([[100.0, 900.0]]), np.array([80.0]))
+    place = utm.utm_from_degrees(ground[:, 0], ground[:, 1], frame.zone, is_south=False)
     x = (np.append(place[0], 80.0) - frame.origin) / frame.scale
     assert np.abs(fit.A @ x + fit.b - [100, 900, 80 - frame.origin[2]]).max() < 0.05
     with pytest.raises(InputError, match=r"curved: .* pixels"):
@@ -273,26 +273,24 @@ def test_an_affine_map_becomes_a_camera():
 
 def test_convergence_by_hand():
     """3 degrees east of a meridian at 60 N: atan(0.0524078 x 0.8660254) = 2.59867 degrees; west or south, minus it."""
-    assert cameras.grid_convergence(18.0, 60.0, 33) == pytest.approx(2.59867, abs=1e-5)
-    assert cameras.grid_convergence(12.0, 60.0, 33) == pytest.approx(-2.59867, abs=1e-5)
-    assert cameras.grid_convergence(18.0, -60.0, 33) == pytest.approx(-2.59867, abs=1e-5)
+    assert utm.grid_convergence(18.0, 60.0, 33) == pytest.approx(2.59867, abs=1e-5)
+    assert utm.grid_convergence(12.0, 60.0, 33) == pytest.approx(-2.59867, abs=1e-5)
+    assert utm.grid_convergence(18.0, -60.0, 33) == pytest.approx(-2.59867, abs=1e-5)
 
 
 @pytest.mark.parametrize(("longitude", "latitude"), [(17.8, 55.0), (12.2, 33.0), (17.0, -70.0)])
 def test_the_sun_in_the_north_is_where_utm_has_the_north(longitude, latitude):
     """A sun due north is along the meridian's image, by differences of UTM; one due east at a right angle to it."""
-    places = cameras.utm_from_degrees(
-        np.full(2, longitude), latitude + np.array([-1e-4, 1e-4]), 33, is_south=latitude < 0
-    )
+    places = utm.utm_from_degrees(np.full(2, longitude), latitude + np.array([-1e-4, 1e-4]), 33, is_south=latitude < 0)
     north = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
-    convergence = cameras.grid_convergence(longitude, latitude, 33)
-    assert_allclose(cameras.sun_direction(0, 0, convergence)[:2], north, atol=2e-5)  # 0.001 degrees
-    assert_allclose(cameras.sun_direction(90, 0, convergence)[:2], [north[1], -north[0]], atol=2e-5)
+    convergence = utm.grid_convergence(longitude, latitude, 33)
+    assert_allclose(utm.sun_direction(0, 0, convergence)[:2], north, atol=2e-5)  # 0.001 degrees
+    assert_allclose(utm.sun_direction(90, 0, convergence)[:2], [north[1], -north[0]], atol=2e-5)
 
 
 def test_sun_by_hand():
-    assert_allclose(cameras.sun_direction(90, 45, 0), [0.5**0.5, 0, 0.5**0.5], atol=EXACT)
-    assert_allclose(cameras.sun_direction(32, 0, 2), [0.5, 0.75**0.5, 0], atol=EXACT)
+    assert_allclose(utm.sun_direction(90, 45, 0), [0.5**0.5, 0, 0.5**0.5], atol=EXACT)
+    assert_allclose(utm.sun_direction(32, 0, 2), [0.5, 0.75**0.5, 0], atol=EXACT)
 
 
 # --- light ---

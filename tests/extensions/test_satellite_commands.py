@@ -15,7 +15,8 @@ from test_satellite import make_rpc, text_of
 from minisplat_ref.app.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.satellite import scene as reading
-from minisplat_ref.extensions.satellite.cameras import localise, read_rpc, utm_from_degrees
+from minisplat_ref.extensions.satellite.rpc import localise, read_rpc
+from minisplat_ref.extensions.satellite.utm import utm_from_degrees
 from minisplat_ref.io import load_ply, load_scene, save_ply, write_image
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.label import Label

@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError, one_line
 from minisplat_ref.extensions.satellite.cameras import (
-    RASTERS,
     Frame,
     check_altitudes,
     choose_frame,
     fit_rpc,
     make_affine_camera,
-    open_raster,
-    read_rpc,
-    sun_direction,
 )
+from minisplat_ref.extensions.satellite.rasters import RASTERS, open_raster
+from minisplat_ref.extensions.satellite.rpc import read_rpc
+from minisplat_ref.extensions.satellite.utm import sun_direction
 from minisplat_ref.interface.arguments import HelpFormatter, integer, list_of
 from minisplat_ref.io import write_image
 from minisplat_ref.io.atomic import making_folder

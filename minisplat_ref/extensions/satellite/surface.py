@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.satellite.cameras import import_rasterio, make_affine_camera
+from minisplat_ref.extensions.satellite.cameras import make_affine_camera
 from minisplat_ref.extensions.satellite.model import SATELLITE
+from minisplat_ref.extensions.satellite.rasters import import_rasterio
 from minisplat_ref.extensions.satellite.scene import read_frame
 from minisplat_ref.interface.arguments import HelpFormatter, positive
 from minisplat_ref.io import write_image
