@@ -80,7 +80,7 @@ def test_a_run_keeps_it(tmp_path, capsys):
     assert json.loads((run / "metrics.json").read_text())["psnr"] == psnr
     capsys.readouterr()
     assert main(["convert", str(run), str(tmp_path / "scene.ply")]) == 0
-    assert "a .ply does not hold compensation" in capsys.readouterr().err
+    assert "Gaussians alone: the compensation of opacities\n" in capsys.readouterr().err
     assert main(["convert", str(run), str(tmp_path / "scene.html")]) == 0
     said = "minisplat-ref: the page shows plain 3DGS, without the compensation of opacities\n"
     assert capsys.readouterr().err == said, "each part once"

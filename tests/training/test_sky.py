@@ -203,4 +203,4 @@ def test_a_run_keeps_its_sky(run, tmp_path, capsys):
 
     capsys.readouterr()
     assert main(["convert", str(run), str(tmp_path / "scene.ply")]) == 0
-    assert "a .ply does not hold sky" in capsys.readouterr().err
+    assert "scene.ply, which has Gaussians alone: the sky\n" in capsys.readouterr().err

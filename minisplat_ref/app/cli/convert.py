@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
         make_upright,
         open_source,
     )
+    from minisplat_ref.app.runs.model_file import describe_parts
     from minisplat_ref.io.formats import mapped, write_file
     from minisplat_ref.io.other_places import SOG_LEVELS
     from minisplat_ref.io.upright import describe_up
@@ -126,8 +127,8 @@ def run(args: argparse.Namespace) -> int:
     size = f"{out.stat().st_size:,} bytes"
     print(f"{len(source.model.gaussians.means):,} Gaussians of {source.what} in {out}, {size}", *lines, sep="\n")
     own = source.owner.representation.rates.of if source.owner.saves_plain else {}  # its files need none of these
-    if names := ", ".join(name for name in source.model.shared if name not in own):
-        print(f"minisplat-ref: a {out.suffix} does not hold {names}, which belong to no row", file=sys.stderr)
+    if parts := [name for name in source.model.shared if name not in own]:
+        print(f"minisplat-ref: left out of {out}, which has Gaussians alone: {describe_parts(parts)}", file=sys.stderr)
     return 0
 
 
