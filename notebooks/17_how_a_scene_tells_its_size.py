@@ -43,7 +43,7 @@ from minisplat_ref.strategy.ops import concat
 from minisplat_ref.strategy.track_gains import estimate_gains
 from minisplat_ref.training.calibration import EXPOSURES, NONE, TRACKS
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.pace import held_out_ids, trained_ids
+from minisplat_ref.training.pace import measured_ids, trained_ids
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.types import Camera, Gaussians
 
@@ -267,7 +267,7 @@ exposed = {
     for source in (TRACKS, NONE)
 }
 
-held = held_out_ids(len(true_gains), recipe.cooling.hold_out_every)
+held = measured_ids(len(true_gains), recipe.cooling.hold_out_every)
 planted, shown = np.log(true_gains) - np.log(true_gains).mean(), found.log_gains.mean(axis=1)
 figure, axes = plt.subplots(1, 5, figsize=(11, 2.7), width_ratios=(1, 1, 1, 1.3, 1.3), layout="constrained")
 for panel, k in zip(axes, np.argsort(true_gains)[[0, 12, -1]], strict=False):

@@ -1,7 +1,8 @@
 """A training that decides when to end and what it needs: its measurements, its decisions, and the reasons.
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
-measure the gain of more iterations; test views are never used. When an action of the recipe decides that the gain is
+measure the gain of more iterations; test views are never used. Of few views none is held back: they are worth more in
+the training than as two votes on its length. When an action of the recipe decides that the gain is
 small, or when the given number of iterations leaves no more time, a cool-down with falling rates ends the training
 (:func:`minisplat_ref.training.state.begin_cooling`); from some point of it, all training views are trained on. So a
 plateau is due to the scene and not to falling rates. Large photographs are halved at first; there, the decision is to
@@ -112,9 +113,15 @@ class Cooling(NamedTuple):
     """The same for rates per unit of the scene's extent; until the end, the factors' logarithms fall linearly."""
     hold_out_every: int
     """Until the cool-down, and until the end of a prune, one in this many training views is held back for decisions."""
+    hold_out_from: int = 0
+    """Training views from which on some are held back; of fewer, all are trained on from the first iteration on."""
     prune_passes: int = 0
     """Passes over all training views that a prune takes while the rates fall; 0 if the recipe has none. The prune ends
     the holding back, too."""
+
+    def holds_out(self, n_views: int) -> bool:
+        """Return whether some of this many training views are held back."""
+        return n_views >= self.hold_out_from
 
     def factors(self, step: int, pace: Pace) -> tuple[float, float]:
         """Return the factors of the rates, and of those per unit of the extent, at an iteration.
@@ -145,8 +152,10 @@ def gains_per_doubling(measurements: Sequence[Measurement]) -> Floats | None:
     return slopes
 
 
-def held_out_ids(n_views: int, every: int) -> list[int]:
-    """Return the training views that are held back: every ``every``-th, at least two, spread over the list.
+def measured_ids(n_views: int, every: int) -> list[int]:
+    """Return the training views that are measured: every ``every``-th, at least two, spread over the list.
+
+    They are held back, unless there are too few views for that (:meth:`Cooling.holds_out`).
 
     Parameters
     ----------
@@ -161,9 +170,9 @@ def held_out_ids(n_views: int, every: int) -> list[int]:
 
 def trained_ids(n_views: int, cooling: Cooling | None, pace: Pace) -> list[int]:
     """Return the training views that gradient steps may use now."""
-    if cooling is None or not pace.holds_out:
+    if cooling is None or not pace.holds_out or not cooling.holds_out(n_views):
         return list(range(n_views))
-    held = set(held_out_ids(n_views, cooling.hold_out_every))
+    held = set(measured_ids(n_views, cooling.hold_out_every))
     return [k for k in range(n_views) if k not in held]
 
 

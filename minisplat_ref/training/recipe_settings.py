@@ -2,8 +2,8 @@
 
 A setting is a keyword argument that ``functools.partial`` has bound to a function of the recipe: an event's action, a
 loss term, or a part of the representation. Its name is the argument's, so that no list of settings is kept anywhere.
-Five more kinds have no function: weights of loss terms, calibrations that are on, the source of the exposures,
-``starts_densely`` and ``dropout``.
+Six more kinds have no function: weights of loss terms, calibrations that are on, the source of the exposures,
+``starts_densely``, ``dropout`` and, of a recipe that decides its own length, ``hold_out_from``.
 """
 
 import inspect
@@ -27,6 +27,8 @@ START = "starts_densely"
 """The setting of :attr:`Recipe.starts_densely`."""
 DROPOUT = "dropout"
 """The setting of :attr:`Recipe.dropout`, a share."""
+HOLD_OUT_FROM = "hold_out_from"
+"""The setting of :attr:`minisplat_ref.training.pace.Cooling.hold_out_from`, a number of training views."""
 DSSIM = "dssim_weight"
 """The setting of :func:`minisplat_ref.training.losses.photometric`, a share."""
 
@@ -67,6 +69,7 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
     functions = (parts.extend, parts.shared, parts.renderer.render, parts.from_file)
     representation = [bound_settings(function) for function in functions if function is not None]
     of_recipe = [{START: recipe.starts_densely, DROPOUT: recipe.dropout}]
+    of_recipe += [{HOLD_OUT_FROM: recipe.cooling.hold_out_from}] if recipe.cooling else []
     found = [*events, *terms, *source, *switches, *representation, *of_recipe]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
@@ -109,6 +112,9 @@ def configure(recipe: Recipe, **settings: Any) -> Recipe:
             starts_densely=value if name == START else recipe.starts_densely,
             dropout=value if name == DROPOUT else recipe.dropout,
             exposure=value if is_source else recipe.exposure,
+            cooling=recipe.cooling._replace(hold_out_from=value)
+            if recipe.cooling and name == HOLD_OUT_FROM
+            else recipe.cooling,
         )
     return _hold_refined_exposures(recipe)
 

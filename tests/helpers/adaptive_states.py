@@ -6,7 +6,11 @@ from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.state import Iteration
+
+HOLDING = configure(ADAPTIVE, hold_out_from=0)
+"""Holds two views out of the few that a quick test has."""
 
 
 def state_of(scene, truth):
@@ -23,5 +27,5 @@ def iteration_of(scene, step=600):
         *(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background)),
         step=step,
         iterations=30_000,
-        cooling=ADAPTIVE.cooling,
+        cooling=HOLDING.cooling,
     )

@@ -29,15 +29,15 @@ DONE = {
     "bands": "colours that hardly depend on the direction were made simpler",
 }
 HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")
-PSNR = "PSNR of the held-out training views (dB)"
+PSNR = "PSNR of the measured training views (dB)"
 FIGURES_TEXT = """\
-Thin lines are the held-out training views, the thick one is their mean, broken lines are decisions. The work is the
+Thin lines are the measured training views, the thick one is their mean, broken lines are decisions. The work is the
 number of pairs of a tile and a Gaussian, of all iterations so far."""
 SIZES_TEXT = "Views of another size have their own line: larger ones show more that can be wrong."
 SLOPE_TEXT = "A red line has the slope by which it was decided that little was left to gain."
 
 
-def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
+def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = False, holds_out: bool = True) -> str:
     """Return the part of a page about the decisions.
 
     Parameters
@@ -48,8 +48,10 @@ def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = Fal
         That the run has done.
     has_schedule : bool
         Whether the recipe's length and rates are fixed.
+    holds_out : bool
+        Whether the views that were measured were held back.
     """
-    text = story(pace, n_iterations, has_schedule=has_schedule)
+    text = story(pace, n_iterations, has_schedule=has_schedule, holds_out=holds_out)
     parts = [paragraph(text)] if text else []
     if pace.measurements and can_plot():
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
@@ -61,7 +63,7 @@ def decisions_section(pace: Pace, n_iterations: int, *, has_schedule: bool = Fal
     return section("What was decided, and why", *parts)
 
 
-def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
+def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False, holds_out: bool = True) -> str:
     """Return in sentences what the decisions rest on, and how the training ended."""
     n = len(pace.measurements)
     sentences = []
@@ -71,8 +73,9 @@ def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False) -> str:
             f" {part[-1].step:,}"
             for part in _group_by_size(pace)
         ]
+        which = "held back" if holds_out else "trained on, like all others,"
         sentences.append(
-            f"{len(pace.measurements[0].psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}:"
+            f"{len(pace.measurements[0].psnrs)} training views were {which} and measured {n} time{'s'[: n > 1]}:"
             f" {', at twice the size '.join(rises)}."
         )
     if has_schedule:

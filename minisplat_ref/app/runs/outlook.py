@@ -4,9 +4,9 @@ Three things are open. *When the views become larger, or the rates begin to fall
 recipe names (``min_step``), and at once if the next measurement says so. It depends on the gain of the held-out views
 for each doubling of the work. If a doubling brings half of what the one before has brought, a gain g falls to
 ``min_gain`` after ``g / min_gain`` times the iterations so far; until a gain is known, nothing says how long it may
-take. *How long an iteration takes at the next size*: longer, but not by as much as there are more pixels. *How long the
-sizes to come are trained on*: about as long as is needed to measure a gain again. After the decision the end is known,
-and the progress bar tells it.
+take. Where views are too few to hold some out, it is as soon as it may be. *How long an iteration takes at the next
+size*: longer, but not by as much as there are more pixels. *How long the sizes to come are trained on*: about as long
+as is needed to measure a gain again. After the decision the end is known, and the progress bar tells it.
 """
 
 from collections import deque
@@ -78,6 +78,8 @@ def foresee_decision(plan: Plan, pace: Pace, step: int) -> Range:
     begun = max((decision.step for decision in pace.decisions if decision.what == FINER), default=0)
     first = begun + NEXT_SIZE[0] * plan.earliest if begun else plan.earliest
     least = min(max(step, first), plan.latest)
+    if not plan.cooling.holds_out(plan.n_views):
+        return Range(least, least)
     gains = gains_per_doubling(pace.recent())
     if step < plan.earliest or gains is None or plan.min_gain <= 0:
         return Range(least, None)

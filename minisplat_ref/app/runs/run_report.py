@@ -83,8 +83,9 @@ def report_html(folder: Path, scene: Scene, metrics: dict[str, Any], shown: str 
         sections.append(section("Trained in blocks", paragraph(BLOCKS_TEXT), plan))
     if (folder / run_folder.DECISIONS).exists():
         pace = pace_from_json(run_folder.read_json_object(folder / run_folder.DECISIONS))
-        has_schedule = configure_recipe(settings).cooling is None
-        sections.append(decisions_section(pace, n_iterations, has_schedule=has_schedule))
+        cooling = configure_recipe(settings).cooling
+        holds_out = cooling is not None and cooling.holds_out(len(scene.train_views))
+        sections.append(decisions_section(pace, n_iterations, has_schedule=cooling is None, holds_out=holds_out))
     if log:
         sections.append(section("How the training went", _curves(folder, log)))
     if (folder / run_folder.EVENTS).exists():

@@ -11,7 +11,9 @@ small gradient, so growth fades where a scene has enough.
 *View dependence.* Each Gaussian has as many degrees of the harmonics as the views that show it determine.
 
 *Measure.* Every 100 iterations the held-out training views are rendered. The gain of their PSNR for each doubling of
-the work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work.
+the work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work. Of fewer
+than 16 training views none is held out: they are worth more in the training than two of them as votes on its length,
+so it continues as soon as it may.
 
 *See more, and cool down.* Large photographs are halved at first. When the slope falls below a threshold, they are shown
 at twice the size; when they are as they were taken, rates fall and all training views are trained on

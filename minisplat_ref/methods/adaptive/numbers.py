@@ -48,6 +48,9 @@ not 27.59 (B)."""
 
 HOLD_OUT_EVERY = 8
 """One in this many training views is held out. No reason recorded."""
+HOLD_OUT_FROM = 2 * HOLD_OUT_EVERY
+"""Training views from which on some are held out. Two are the least that have a standard error, and of fewer views
+than this they would be a greater part than one in HOLD_OUT_EVERY (W)."""
 VIEW_SIDE_MIN = 120
 """Pixels: no side of a halved view is shorter. With 60 some scenes gain, but on snowmiku calibrations were found
 where there are none (J)."""

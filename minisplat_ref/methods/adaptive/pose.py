@@ -17,7 +17,7 @@ import numpy as np
 
 from minisplat_ref.methods.adaptive.evidence import Answer, displacements, pose_evidence
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, zero_corrections
-from minisplat_ref.training.pace import held_out_ids, trained_ids
+from minisplat_ref.training.pace import measured_ids, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Camera, Floats
 
@@ -49,7 +49,9 @@ def turn_held_out(state: TrainState, iteration: Iteration) -> str | None:
     if ROTATIONS not in state.shared or iteration.cooling is None or not state.pace.holds_out:
         return "nothing done: no poses are refined"
     views = iteration.scene.train_views
-    ids = held_out_ids(len(views), iteration.cooling.hold_out_every)
+    if not iteration.cooling.holds_out(len(views)):
+        return "nothing done: no views are held out"
+    ids = measured_ids(len(views), iteration.cooling.hold_out_every)
     found = displacements(state, iteration, ids)
     for index, displacement in zip(ids, found, strict=True):
         state.shared[ROTATIONS][index] += displacement_rotation(views[index].camera, displacement)

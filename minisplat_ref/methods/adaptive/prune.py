@@ -5,14 +5,15 @@ The contribution of most Gaussians to the images is then known:
 the training views. Those that are not worth their place are removed, a slice at a time; after each slice the training
 repairs what it can, and the changes are recomputed.
 
-The cost is measured, too, on the training views that are held out. Meanwhile their error falls because the rates do,
-which hides what the slices cost; so a line predicts what the error would be without them. The squared error of a view
-is ``a + b r``, where r is the factor of the means' rate: what the model cannot show, and what comes of steps that are
-too long. Both are fitted to N_FITTED measurements before the first slice; so are those of 1 - SSIM. When the next
-slice would cost more than a tenth of a decibel, or five thousandths of SSIM, in all, the prune ends. To let the prune
-go on within the standard error of this cost was tried: two views agree or disagree by chance, and on ten photographs
-it removed Gaussians that held-out ones needed (N). The prune also ends where no further slice is due: at the end of the
-cool-down nothing is removed, and all photographs are trained on, so that it can converge.
+The cost is measured, too, on the training views that are held out, or with too few to hold some out, on two of them.
+Meanwhile their error falls because the rates do, which hides what the slices cost; so a line predicts what the error
+would be without them. The squared error of a view is ``a + b r``, where r is the factor of the means' rate: what the
+model cannot show, and what comes of steps that are too long. Both are fitted to N_FITTED measurements before the first
+slice; so are those of 1 - SSIM. When the next slice would cost more than a tenth of a decibel, or five thousandths of
+SSIM, in all, the prune ends. To let the prune go on within the standard error of this cost was tried: two views agree
+or disagree by chance, and on ten photographs it removed Gaussians that held-out ones needed (N). The prune also ends
+where no further slice is due: at the end of the cool-down nothing is removed, and all photographs are trained on, so
+that it can converge.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from scipy.optimize import lsq_linear
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.adaptive.numbers import GAP_MIN, LAST_SLICE, N_SLICES, N_UNPRUNED, SLICE_MIN
-from minisplat_ref.methods.adaptive.progress import evaluate_held_out
+from minisplat_ref.methods.adaptive.progress import evaluate_measured
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
@@ -74,7 +75,7 @@ def prune_in_slices(
     max_pruned : float
         A slice is at most this fraction of the Gaussians.
     max_psnr_cost, max_ssim_cost : float
-        What all slices together may cost on the held-out training views, dB and without a unit.
+        What all slices together may cost on the measured training views, dB and without a unit.
     """
     if not state.pace.is_pruning or iteration.cooling is None:
         return
@@ -84,15 +85,16 @@ def prune_in_slices(
             take_all_views(state)
         return
     iteration.fetch()
-    now = evaluate_held_out(state, iteration, iteration.cooling, has_ssim=True)
+    now = evaluate_measured(state, iteration, iteration.cooling, has_ssim=True)
     state.pace = state.pace._replace(while_cooling=(*state.pace.while_cooling, now))
     if number < 0:
         return
     rates = [iteration.cooling.factors(m.step, state.pace)[1] for m in state.pace.while_cooling]
     psnr, ssim = foresee_costs(state.pace.while_cooling, rates)
     if psnr.mean > max_psnr_cost or ssim.mean > max_ssim_cost:
+        which = "held-out" if iteration.cooling.holds_out(len(iteration.scene.train_views)) else "measured training"
         why = (
-            f"with more removed, the held-out views might lose {psnr.mean:z.2f} ± {psnr.standard_error:.2f} dB and"
+            f"with more removed, the {which} views might lose {psnr.mean:z.2f} ± {psnr.standard_error:.2f} dB and"
             f" {ssim.mean:z.4f} ± {ssim.standard_error:.4f} of SSIM in all; at most {max_psnr_cost:g} dB and"
             f" {max_ssim_cost:g} are allowed"
         )

@@ -6,7 +6,7 @@ from minisplat_ref.methods.adaptive import numbers
 from minisplat_ref.methods.adaptive.degrees import cut_degrees_when_cooling, raise_degrees
 from minisplat_ref.methods.adaptive.growth import collect_while_growing, grow
 from minisplat_ref.methods.adaptive.pose import hold_mean_pose, turn_held_out
-from minisplat_ref.methods.adaptive.progress import measure_held_out, proceed_when_little_is_gained
+from minisplat_ref.methods.adaptive.progress import measure_progress, proceed_when_little_is_gained
 from minisplat_ref.methods.adaptive.prune import prune_in_slices
 from minisplat_ref.methods.adaptive.switches import switch_antialiasing_on, switch_pose_on, switch_sky_on
 from minisplat_ref.methods.adaptive.veils import remove_veils
@@ -44,7 +44,7 @@ ADAPTIVE = GS._replace(
         At(numbers.ANTIALIASING_STEP, partial(switch_antialiasing_on, min_antialiasing_gain=numbers.GAIN_MIN)),
         At(numbers.POSE_STEP, partial(switch_pose_on, min_pose_gain=numbers.GAIN_MIN)),
         _regularly(turn_held_out),
-        _regularly(measure_held_out),
+        _regularly(measure_progress),
         _regularly(
             partial(proceed_when_little_is_gained, min_gain=numbers.SLOPE_MIN, min_step=numbers.DECISION_STEP_MIN)
         ),
@@ -89,6 +89,7 @@ ADAPTIVE = GS._replace(
         numbers.COOLING_LAST,
         numbers.COOLING_LAST_PER_EXTENT,
         numbers.HOLD_OUT_EVERY,
+        numbers.HOLD_OUT_FROM,
         prune_passes=numbers.N_SLICES + 1,
     ),
 )

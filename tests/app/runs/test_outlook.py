@@ -36,6 +36,14 @@ def test_a_gain_halves_with_each_doubling_of_the_work():
     assert foresee_decision(PLAN._replace(min_gain=0.0), measured(9.0, 800, 900, 1000, 1100), 1100) == (1100, None)
 
 
+def test_few_views_do_not_decide():
+    """Ten of at least sixteen: at iteration 800, or at once, whatever they gain."""
+    plan = PLAN._replace(cooling=COOLING._replace(hold_out_from=16))
+    assert foresee_decision(plan, Pace(), 100) == (800, 800)
+    assert foresee_decision(plan, measured(9.0, 800, 1000, 1200, 1400), 1400) == (1400, 1400)
+    assert foresee_rest(plan, Pace(), 400, 0, 0.1) == pytest.approx((82, 82))
+
+
 def test_larger_views_are_decided_on_again():
     pace = Pace(decisions=(Decision(900, FINER, "", 0.1, 0.1),))
     assert foresee_decision(PLAN, pace, 950) == (1300, None)  # 400 iterations after the first decision

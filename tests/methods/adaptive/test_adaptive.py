@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from adaptive_states import HOLDING
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -31,7 +32,7 @@ from minisplat_ref.training.pace import (
     Decision,
     Measurement,
     Pace,
-    held_out_ids,
+    measured_ids,
     pace_from_json,
     pace_to_json,
     trained_ids,
@@ -41,8 +42,8 @@ from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.state import Iteration
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
-COOLING = ADAPTIVE.cooling
-FAST = configure(ADAPTIVE._replace(iterations=700), min_gain=1e9, min_step=300)  # ends as soon as it may
+COOLING = HOLDING.cooling
+FAST = configure(HOLDING._replace(iterations=700), min_gain=1e9, min_step=300)  # ends as soon as it may
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def reports(scene):
 
 @pytest.mark.parametrize("n", [*range(5, 40), 200])
 def test_held_out_views_are_spread_and_leave_most(n):
-    ids = held_out_ids(n, 8)
+    ids = measured_ids(n, 8)
     assert len(ids) == len(set(ids)) == max(2, n // 8) and 0 <= min(ids) and max(ids) < n
     gaps = np.diff(ids)
     assert len(gaps) == 0 or gaps.max() - gaps.min() <= 1
@@ -76,9 +77,15 @@ def test_held_out_views_are_spread_and_leave_most(n):
     assert trained_ids(n, COOLING, Pace(cooling_from=3)) == trained_ids(n, None, Pace()) == list(range(n))
 
 
+@pytest.mark.parametrize(("n", "n_trained"), [(5, 5), (15, 15), (16, 14), (24, 21)])
+def test_of_few_views_none_is_held_out(n, n_trained):
+    """Two of 15 would be more than one in eight."""
+    assert len(trained_ids(n, ADAPTIVE.cooling, Pace())) == n_trained
+
+
 def test_no_step_is_taken_on_held_out_views_before_the_cool_down(scene, reports):
     seen, state = reports
-    held = {scene.train_views[k].name for k in held_out_ids(len(scene.train_views), COOLING.hold_out_every)}
+    held = {scene.train_views[k].name for k in measured_ids(len(scene.train_views), COOLING.hold_out_every)}
     constant = {view for step, view, _, _ in seen if step <= state.pace.cooling_from}
     cooling = {view for step, view, _, _ in seen if step > state.pace.cooling_from}
     assert not constant & held and held <= cooling
@@ -119,12 +126,18 @@ def measured(psnrs_of_steps, **changes):
     return state
 
 
-def iteration(step):
-    return Iteration(*[None] * 5, step=step, iterations=30_000, cooling=COOLING)
+class Photographs:
+    """A scene of fifteen training views."""
+
+    train_views = (None,) * 15
 
 
-def decide(state, step):
-    return proceed_when_little_is_gained(state, iteration(step), min_gain=0.3, min_step=800)
+def iteration(step, cooling=COOLING):
+    return Iteration(Photographs, *[None] * 4, step=step, iterations=30_000, cooling=cooling)
+
+
+def decide(state, step, cooling=COOLING):
+    return proceed_when_little_is_gained(state, iteration(step, cooling), min_gain=0.3, min_step=800)
 
 
 def test_a_slope_by_hand():
@@ -139,6 +152,27 @@ def test_a_slope_by_hand():
     (decision,) = state.pace.decisions
     assert decision.gain == pytest.approx(0.2) and decision.standard_error == pytest.approx(0.3)
     assert (state.pace.cooling_from, state.pace.last_step, state.view_order) == (1600, 2560, [])
+
+
+def test_few_views_are_not_asked():
+    """However much they gain, as they are trained on; but not before 800, nor with less than four measurements."""
+    steep = [(s, (np.log2(s), np.log2(s))) for s in (400, 500, 600, 700, 800)]
+    assert decide(measured(steep[:4]), 700, ADAPTIVE.cooling) is None
+    assert decide(measured(steep[2:]), 800, ADAPTIVE.cooling) is None
+    state = measured(steep)
+    assert "15 training views are too few to hold some out" in decide(state, 800, ADAPTIVE.cooling)
+    (decision,) = state.pace.decisions
+    assert (decision.what, decision.gain, decision.standard_error) == ("cool down", None, None)
+    assert (state.pace.cooling_from, state.pace.last_step) == (800, 1280)
+    assert decide(measured(steep), 800) == "1.00 dB from twice the work"
+
+
+def test_all_of_few_views_are_trained_on(scene):
+    """From the first iteration on, until the rates fall."""
+    seen = []
+    recipe = configure(ADAPTIVE._replace(iterations=100), min_step=10_000)
+    train(scene, recipe, seed=0, on_step=lambda r: seen.append((r.last_step, r.view.name)))
+    assert {name for last, name in seen if last is None} == {view.name for view in scene.train_views}
 
 
 def test_no_decision_without_evidence():
@@ -243,7 +277,7 @@ def cooling(scene):
     state.gaussians.means[0] = 100 * (centres.mean(axis=0) - scene.points.mean(axis=0))
     state.pace = Pace(cooling_from=10, last_step=270, is_pruning=True)  # the first slice is due at 111
     here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background))
-    return state, here._replace(cooling=ADAPTIVE.cooling)
+    return state, here._replace(cooling=COOLING)
 
 
 def test_what_few_views_see_goes_with_the_first_slice(cooling):
@@ -286,7 +320,7 @@ def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypa
     *unpruned, first, second, third = of_values([20.0] * 6 + [19.9] * 2, [0.50] * 6 + [0.49] * 2)
     state.pace = state.pace._replace(while_cooling=tuple(unpruned))
     values = iter((first, second, third))
-    monkeypatch.setattr(prune, "evaluate_held_out", lambda *_, **__: next(values))
+    monkeypatch.setattr(prune, "evaluate_measured", lambda *_, **__: next(values))
     settings = PRUNING | {"min_slope": 1e9, "max_psnr_cost": limits[0], "max_ssim_cost": limits[1]}
     n_trained = len(trained_ids(len(here.scene.train_views), here.cooling, state.pace))
     assert n_trained < len(here.scene.train_views)
@@ -298,6 +332,7 @@ def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypa
         len(here.scene.train_views) if ends else n_trained
     )
     assert (state.view_order == []) == bool(ends)
+    assert not ends or "the held-out views might lose" in state.pace.decisions[-1].why
     n = len(state.gaussians.means)
     prune_in_slices(state, here._replace(step=151), **settings)
     assert (len(state.gaussians.means) == n) == bool(ends)
@@ -385,7 +420,7 @@ def scene_folder(tmp_path_factory):
     return folder
 
 
-SETTINGS = ["--set", "min_gain=1e9", "--set", "min_step=300"]
+SETTINGS = ["--set", "min_gain=1e9", "--set", "min_step=300", "--set", "hold_out_from=0"]
 
 
 def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):

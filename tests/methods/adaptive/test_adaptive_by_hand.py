@@ -11,7 +11,7 @@ from adaptive_states import iteration_of, state_of
 from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, Half, weigh
 from minisplat_ref.methods.adaptive.growth import collect_while_growing, grow
 from minisplat_ref.methods.adaptive.pose import displacement_rotation
-from minisplat_ref.methods.adaptive.progress import evaluate_held_out
+from minisplat_ref.methods.adaptive.progress import evaluate_measured
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.sky import Behind, fit_sky, open_pixels, sum_photographs
 from minisplat_ref.methods.adaptive.switches import SWITCHES
@@ -19,7 +19,7 @@ from minisplat_ref.metrics import ssim
 from minisplat_ref.rendering import SPLATTING, RenderSettings, render
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import EXPOSURES, identity_exposures, with_exposures
-from minisplat_ref.training.pace import Decision, Measurement, Pace, held_out_ids
+from minisplat_ref.training.pace import Decision, Measurement, Pace, measured_ids
 from minisplat_ref.training.rates import present_degrees
 from minisplat_ref.training.schedule import does
 from minisplat_ref.types import Camera, Scene, View
@@ -162,7 +162,7 @@ def test_held_out_views_are_measured_in_their_masks_and_as_they_are_shown():
     scene = scene_with(view_of(camera, photograph, mask))
     iteration = iteration_of(scene)._replace(render_settings=rendering(image))
     state = state_of(scene, balls(np.array([[0.0, 0, 5]]), [0.1], [0.5]))
-    measured = evaluate_held_out(state, iteration, ADAPTIVE.cooling, has_ssim=True)
+    measured = evaluate_measured(state, iteration, ADAPTIVE.cooling, has_ssim=True)
     assert_allclose(measured.psnrs, [16.98970004] * 2, rtol=1e-6)
     assert_allclose(measured.ssims, [ssim(np.clip(image, 0, 1), photograph, mask)] * 2, rtol=1e-6)
     assert abs(measured.ssim - ssim(np.clip(image, 0, 1), photograph)) > 0.05  # the mask matters
@@ -182,10 +182,10 @@ def test_the_exposure_of_held_out_views_is_no_error_of_the_model():
     scene = scene_of([view_of(cameras[i], darker[i], view_id=i) for i in range(6)])
     exposed = RenderSettings(BACKGROUND, renderer=with_exposures(SPLATTING))
     state, iteration = state_of(scene, truth), iteration_of(scene)
-    without = evaluate_held_out(state, iteration, ADAPTIVE.cooling)
+    without = evaluate_measured(state, iteration, ADAPTIVE.cooling)
     state.shared = identity_exposures(6)
-    state.shared[EXPOSURES][held_out_ids(6, ADAPTIVE.cooling.hold_out_every), :, :3] = 0.6 * np.eye(3)
-    measured = evaluate_held_out(state, iteration._replace(render_settings=exposed), ADAPTIVE.cooling)
+    state.shared[EXPOSURES][measured_ids(6, ADAPTIVE.cooling.hold_out_every), :, :3] = 0.6 * np.eye(3)
+    measured = evaluate_measured(state, iteration._replace(render_settings=exposed), ADAPTIVE.cooling)
     assert_allclose(measured.psnrs, 20 * np.log10(255 * np.sqrt(12)), atol=1)
     assert max(without.psnrs) < 20
 

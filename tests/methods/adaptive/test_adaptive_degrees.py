@@ -25,7 +25,7 @@ from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.pace import Pace, held_out_ids
+from minisplat_ref.training.pace import Pace, measured_ids
 from minisplat_ref.training.rates import present_degrees
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
@@ -196,7 +196,7 @@ def test_no_band_for_fewer_views_than_it_needs(matt):
     """Four of six views are trained on before the cool-down, and six are needed for degree 1."""
     scene, truth = matt
     few = scene._replace(train_views=scene.train_views[::4])
-    assert len(few.train_views) - len(held_out_ids(6, 8)) == 4
+    assert len(few.train_views) - len(measured_ids(6, 8)) == 4
     state = train(few, SHORT._replace(iterations=60), seed=0, state=state_of(few, truth))
     assert not state.stats[DEGREES].any() and not state.gaussians.sh_rest.any()
 

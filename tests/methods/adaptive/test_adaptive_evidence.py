@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from adaptive_states import iteration_of, state_of
+from adaptive_states import HOLDING, iteration_of, state_of
 from minisplat_ref.methods.adaptive.evidence import Evidence, Half, displacements, slopes, split_halves, weigh
 from minisplat_ref.methods.adaptive.pose import displacement_rotation, hold_mean_pose, turn_held_out
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
@@ -13,7 +13,7 @@ from minisplat_ref.rendering import render
 from minisplat_ref.rendering.backends import CPU
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
+from minisplat_ref.training.pace import Pace, measured_ids, trained_ids
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import At, Every
@@ -181,7 +181,7 @@ def test_wrong_poses_are_refined_from_their_displacements(disturbed, truth, pixe
     state = state_of(disturbed, truth)
     iteration = iteration_of(disturbed)
     switch_pose_on(state, iteration, min_pose_gain=0.05)
-    ids, held = trained_ids(N_VIEWS, ADAPTIVE.cooling, Pace()), held_out_ids(N_VIEWS, 8)
+    ids, held = trained_ids(N_VIEWS, HOLDING.cooling, Pace()), measured_ids(N_VIEWS, 8)
     relative = pixels[ids] - pixels[ids].mean(axis=0)
     expected = [displacement_rotation(disturbed.train_views[i].camera, d) for i, d in zip(ids, relative, strict=True)]
     focal = disturbed.train_views[0].camera.fx
@@ -191,11 +191,20 @@ def test_wrong_poses_are_refined_from_their_displacements(disturbed, truth, pixe
     assert "are refined" in switch_pose_on(state, iteration, min_pose_gain=0.05)
 
 
+def test_of_few_views_none_is_turned(disturbed, truth):
+    """All are trained on, and their poses with them."""
+    state, here = state_of(disturbed, truth), iteration_of(disturbed)._replace(cooling=ADAPTIVE.cooling)
+    switch_pose_on(state, here, min_pose_gain=0.05)
+    before = state.shared[ROTATIONS].copy()
+    assert "no views are held out" in turn_held_out(state, here)
+    assert_array_equal(state.shared[ROTATIONS], before)
+
+
 def test_held_out_views_are_turned_to_the_scene(disturbed, truth, pixels):
     state = state_of(disturbed, truth)
     switch_pose_on(state, iteration_of(disturbed), min_pose_gain=0.05)
     turn_held_out(state, iteration_of(disturbed))
-    for index in held_out_ids(N_VIEWS, 8):
+    for index in measured_ids(N_VIEWS, 8):
         camera = disturbed.train_views[index].camera
         found = state.shared[ROTATIONS][index] * camera.fx
         assert_allclose(found, displacement_rotation(camera, pixels[index]) * camera.fx, atol=DISPLACEMENT_PX)
@@ -208,7 +217,7 @@ def test_the_mean_correction_stays_zero_in_the_world(disturbed, truth):
     for name in (ROTATIONS, SHIFTS):
         state.shared[name] += rng.normal(size=3) + 0.1 * rng.normal(size=(N_VIEWS, 3))
     hold_mean_pose(state, iteration_of(disturbed, 601))
-    ids = trained_ids(N_VIEWS, ADAPTIVE.cooling, Pace())
+    ids = trained_ids(N_VIEWS, HOLDING.cooling, Pace())
     for name in (ROTATIONS, SHIFTS):
         world = [disturbed.train_views[i].camera.cam_from_world_R.T @ state.shared[name][i] for i in ids]
         assert_allclose(np.mean(world, axis=0), np.zeros(3), atol=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from adaptive_states import iteration_of
+from adaptive_states import HOLDING, iteration_of
 from minisplat_ref.app.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -17,7 +17,7 @@ from minisplat_ref.training.calibration import EXPOSURES, LEARNED, NONE
 from minisplat_ref.training.exposure_gauge import hold_mean_exposure
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
+from minisplat_ref.training.pace import Pace, measured_ids, trained_ids
 from minisplat_ref.training.recipe_settings import configure
 from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import At, Every
@@ -63,7 +63,7 @@ def test_all_photographs_have_the_planted_exposures(disturbed):
     """Held-out training views as well; relative to their mean, which the scene's colours take."""
     state, n = initial_state(disturbed, ADAPTIVE, 0), len(disturbed.train_views)
     planted = np.log(GAINS[:n] / GAINS[:n].mean())
-    held = held_out_ids(n, ADAPTIVE.cooling.hold_out_every)
+    held = measured_ids(n, HOLDING.cooling.hold_out_every)
     found = np.log(state.shared[EXPOSURES][:, range(3), range(3)])
     assert len(held) >= 2 and np.abs(planted[held]).max() > 0.02
     assert_allclose(found, np.tile(planted[:, None], 3), atol=0.03)
@@ -74,7 +74,7 @@ def test_all_photographs_have_the_planted_exposures(disturbed):
 def test_the_mean_is_held_by_the_views_in_training(disturbed):
     """Twelve views, two of them held out; all maps 0.1 too large, so that those in training give 0.12 each."""
     state, n = initial_state(disturbed, ADAPTIVE, 0), len(disturbed.train_views)
-    held, trained = held_out_ids(n, ADAPTIVE.cooling.hold_out_every), trained_ids(n, ADAPTIVE.cooling, Pace())
+    held, trained = measured_ids(n, HOLDING.cooling.hold_out_every), trained_ids(n, HOLDING.cooling, Pace())
     before = state.shared[EXPOSURES].copy()
     hold_mean_exposure(state, iteration_of(disturbed))
     assert_array_equal(state.shared[EXPOSURES], before)  # the mean is where it should be
@@ -129,7 +129,7 @@ def test_training_refines_the_gains_and_continues_byte_for_byte(disturbed, tmp_p
 def test_held_out_views_are_measured_better_with_their_exposures(disturbed):
     """By several decibels: their gains are from 0.8 to 1.25 of the mean."""
     psnrs = {}
-    for recipe in (early(ADAPTIVE), early(configure(ADAPTIVE, exposure=NONE))):
+    for recipe in (early(HOLDING), early(configure(HOLDING, exposure=NONE))):
         state = train(disturbed, recipe._replace(iterations=160), seed=0)
         psnrs[recipe.exposure] = state.pace.measurements[-1].psnr
     assert psnrs["refined"] > psnrs["none"] + 1
@@ -137,7 +137,7 @@ def test_held_out_views_are_measured_better_with_their_exposures(disturbed):
 
 def test_learned_exposures_begin_with_the_identity_and_held_out_views_keep_it(disturbed):
     """Until the rates fall and they are trained on, too."""
-    recipe = configure(early(ADAPTIVE), exposure=LEARNED)
+    recipe = configure(early(HOLDING), exposure=LEARNED)
     seen = []
     train(
         disturbed,
@@ -145,12 +145,12 @@ def test_learned_exposures_begin_with_the_identity_and_held_out_views_keep_it(di
         seed=0,
         on_step=lambda report: seen.append((report.step, report.state.pace, report.state.shared[EXPOSURES].copy())),
     )
-    n, every = len(disturbed.train_views), ADAPTIVE.cooling.hold_out_every
+    n, every = len(disturbed.train_views), HOLDING.cooling.hold_out_every
     step, pace, exposures = [each for each in seen if each[1].cooling_from is None][-1]
     assert step > n and pace.decisions == ()
-    assert_array_equal(exposures[held_out_ids(n, every)], np.tile(IDENTITY, (len(held_out_ids(n, every)), 1, 1)))
-    assert (exposures[trained_ids(n, ADAPTIVE.cooling, Pace())] != IDENTITY).any(axis=(1, 2)).all()
-    assert (seen[-1][2][held_out_ids(n, every)] != IDENTITY).any()
+    assert_array_equal(exposures[measured_ids(n, every)], np.tile(IDENTITY, (len(measured_ids(n, every)), 1, 1)))
+    assert (exposures[trained_ids(n, HOLDING.cooling, Pace())] != IDENTITY).any(axis=(1, 2)).all()
+    assert (seen[-1][2][measured_ids(n, every)] != IDENTITY).any()
 
 
 def test_the_default_recipe_says_so(tmp_path):

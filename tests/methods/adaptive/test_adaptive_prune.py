@@ -58,7 +58,7 @@ def setting(monkeypatch):
         measurement = Measurement(step, (psnr, psnr), n, 0, (ssim, ssim))
         monkeypatch.setattr(prune, "collect_removal_costs", lambda *_: RemovalCosts(costs, 200.0))
         monkeypatch.setattr(prune, "measure_importance", lambda *_: stats)
-        monkeypatch.setattr(prune, "evaluate_held_out", lambda *_, **__: measurement)
+        monkeypatch.setattr(prune, "evaluate_measured", lambda *_, **__: measurement)
         prune_in_slices(state, here._replace(step=step), **SETTINGS | changed)
         return [int(x) for x in state.gaussians.means[:, 0]]
 
