@@ -37,7 +37,7 @@ from minisplat_ref.training.pace import (
     pace_to_json,
     trained_ids,
 )
-from minisplat_ref.training.recipe_settings import configure
+from minisplat_ref.training.recipe_settings import configure, settings_of
 from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.state import Iteration
 
@@ -165,6 +165,12 @@ def test_few_views_are_not_asked():
     assert (decision.what, decision.gain, decision.standard_error) == ("cool down", None, None)
     assert (state.pace.cooling_from, state.pace.last_step) == (800, 1280)
     assert decide(measured(steep), 800) == "1.00 dB from twice the work"
+
+
+def test_only_a_recipe_that_decides_its_length_holds_out():
+    assert settings_of(ADAPTIVE)["hold_out_from"] == 16
+    with pytest.raises(InputError, match="recipe 3dgs has no hold_out_from to set"):
+        configure(get_recipe("3dgs"), hold_out_from=0)
 
 
 def test_all_of_few_views_are_trained_on(scene):
