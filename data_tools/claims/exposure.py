@@ -59,7 +59,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARM
         result[arm] = {
             "levels": (255 * color_errors(recovered, truth, colors)).tolist(),
             "mean_color": {name: map_mean(maps, colors) for name, maps in (("true", truth), ("found", recovered))},
-            "psnr": measure_progress_psnr(state.gaussians, scene, K),
+            "psnr": measure_held_out_psnr(state.gaussians, scene, K),
         }
     return result
 
@@ -120,7 +120,7 @@ def inverse(K: Floats) -> Floats:
     return np.column_stack([M, -M @ K[:, 3]])
 
 
-def measure_progress_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
+def measure_held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
     """Return the mean PSNR of the test views, whose renderings are mapped by the inverse of K.
 
     The renderer with exposures does this: its only exposure is the inverse, and every view uses it.

@@ -95,7 +95,7 @@ def measure(
             "degrees": degrees.tolist(),
             "shifts": shifts.tolist(),
             "pixels": [displacement(*pair, scene) for pair in zip(aligned, scene.train_views, strict=True)],
-            "psnr": measure_progress_psnr(state.gaussians, scene, similarity),
+            "psnr": measure_held_out_psnr(state.gaussians, scene, similarity),
         }
     return result
 
@@ -169,7 +169,7 @@ def displacement(camera: Camera, view: View, scene: Scene) -> float:
     return float(np.median(np.linalg.norm(images[0] - images[1], axis=0)))
 
 
-def measure_progress_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) -> float:
+def measure_held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) -> float:
     """Return the mean PSNR of the test views, with their cameras mapped into the trained scene."""
     views = [view._replace(camera=carry_back(view.camera, similarity)) for view in scene.test_views]
     psnr = evaluate(gaussians, views, RenderSettings(scene.background)).psnr

@@ -2,8 +2,8 @@
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
 measure the gain of more iterations; test views are never used. Of few views none is held back: they are worth more in
-the training than as two votes on its length. When an action of the recipe decides that the gain is
-small, or when the given number of iterations leaves no more time, a cool-down with falling rates ends the training
+the training than as two votes on its length. When an action of the recipe decides that the gain is small, or when the
+given number of iterations leaves no more time, a cool-down with falling rates ends the training
 (:func:`minisplat_ref.training.state.begin_cooling`); from some point of it, all training views are trained on. So a
 plateau is due to the scene and not to falling rates. Large photographs are halved at first; there, the decision is to
 train on views of twice the width and height.
