@@ -95,9 +95,10 @@ def _rows() -> dict[str, Row]:
         options = ["--recipe", recipe]
         options += ["--iterations", str(LENGTHS[recipe])] if recipe in LENGTHS else []
         rows[f"fern-{recipe}"] = Row("fern", tuple(options), 25.17, NERF)
-    for recipe in ("3dgs-accel", "mini-splatting2"):
-        few = ("--recipe", recipe, "--downscale", "2", "--iterations", "6000", "--test-every", "2")
-        rows[f"fern-3-{recipe}"] = Row("fern", few, None, "", THREE)
+    for recipe in ("3dgs-accel", "mini-splatting2", "adaptive"):
+        few = ["--recipe", recipe, "--downscale", "2", "--test-every", "2"]
+        few += ["--iterations", "6000"] if recipe != "adaptive" else []
+        rows[f"fern-3-{recipe}"] = Row("fern", tuple(few), None, "", THREE)
     return rows
 
 

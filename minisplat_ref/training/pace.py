@@ -164,7 +164,7 @@ def measured_ids(n_views: int, every: int) -> list[int]:
     every : int
         At least 2.
     """
-    n = min(max(2, n_views // every), n_views // 2)
+    n = min(max(2, n_views // every), n_views)
     return [(2 * k + 1) * n_views // (2 * n) for k in range(n)]
 
 

@@ -35,6 +35,8 @@ examples:
   minisplat-ref photos holiday/fountain
   minisplat-ref photos holiday/fountain --minutes 10 --out fountain"""
 
+MEASURED_FROM = 5  # photographs to train on; with fewer, each counts for more than the measure of one that is held out
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command."""
@@ -134,7 +136,7 @@ def _options_for_few(scene: Path) -> tuple[str, ...]:
     from minisplat_ref.methods.adaptive.numbers import TRAIN_VIEWS_MIN
 
     listing = list_scene(scene, TEST_EVERY)
-    if len(listing.train_photos) >= TRAIN_VIEWS_MIN:
+    if len(listing.train_photos) >= MEASURED_FROM:
         return ()
     n_photographs = len(listing.names)
     recipe = () if n_photographs >= TRAIN_VIEWS_MIN else ("--recipe", "3dgs-accel")

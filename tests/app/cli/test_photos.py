@@ -18,6 +18,7 @@ from minisplat_ref.app.runs.settings import load_up
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import write_image
 from minisplat_ref.io.upright import read_up
+from minisplat_ref.methods.adaptive import numbers
 from run_commands import interrupt_at, write_room
 from textured_world import HEIGHT, WIDTH, take_photographs, write_photographs
 
@@ -170,10 +171,12 @@ def test_a_size_that_trains_in_minutes(size, factor):
 
 
 @pytest.mark.parametrize(
-    ("n_views", "options", "recipe"), [(6, (), "adaptive"), (5, ("0",), "adaptive"), (4, ("0",), "3dgs-accel")]
+    ("n_views", "options", "n_needed", "recipe"),
+    [(6, (), 3, "adaptive"), (5, ("0",), 3, "adaptive"), (3, ("0",), 3, "adaptive"), (3, ("0",), 4, "3dgs-accel")],
 )
-def test_few_photographs_are_all_trained_on(tmp_path, asked, capsys, n_views, options, recipe):
-    """Of six one is held out, of five none; four are fewer than adaptive needs."""
+def test_few_photographs_are_all_trained_on(tmp_path, asked, capsys, monkeypatch, n_views, options, n_needed, recipe):
+    """Of six one is held out, of five none; if adaptive needed four, three would be trained on by another recipe."""
+    monkeypatch.setattr(numbers, "TRAIN_VIEWS_MIN", n_needed)
     write_room(tmp_path / "out" / "scene", **(SCENE | {"n_views": n_views - 1}))  # and one more is held out
     (tmp_path / "photos").mkdir()
     assert photos(tmp_path / "out") == 0
