@@ -73,9 +73,9 @@ def story(pace: Pace, n_iterations: int, *, has_schedule: bool = False, holds_ou
             f" {part[-1].step:,}"
             for part in _group_by_size(pace)
         ]
-        which = "held back" if holds_out else "trained on, like all others,"
+        which = "views were held back and" if holds_out else "views, trained on like all others, were"
         sentences.append(
-            f"{len(pace.measurements[0].psnrs)} training views were {which} and measured {n} time{'s'[: n > 1]}:"
+            f"{len(pace.measurements[0].psnrs)} training {which} measured {n} time{'s'[: n > 1]}:"
             f" {', at twice the size '.join(rises)}."
         )
     if has_schedule:

@@ -84,7 +84,7 @@ def proceed_when_little_is_gained(
             return f"{gain:.2f} dB from twice the work"
         why = f"twice the work would bring the held-out views {gain:.2f} dB, less than {min_gain:g} dB"
     else:
-        why = f"{n_views} training views are too few to hold some out and ask them: it continues as soon as it may"
+        why = f"{n_views} training views are too few to hold some out, so this comes as soon as it may"
     if iteration.n_halvings:
         state.pace = pace.with_decision(Decision(iteration.step, FINER, why, gain, error))
     else:

@@ -168,7 +168,7 @@ def test_decisions_are_told_with_their_evidence():
     assert "from 21.00 dB after 100 iterations to 28.00 dB after 800" in text
     assert text.startswith("2 training views were held back and measured 8 times: from")
     of_few = story(PACE, 1280, holds_out=False)
-    assert of_few.startswith("2 training views were trained on, like all others, and measured 8 times: from")
+    assert of_few.startswith("2 training views, trained on like all others, were measured 8 times: from")
     assert text.endswith("continued to iteration 1,280, its end.")
     page_ = decisions_section(PACE, 1280)
     assert page_.count("<svg") == 2 and "A red line has the slope" in page_ and "0.050" in page_
