@@ -3,7 +3,8 @@
 ``python -m data_tools.published_scenes ROW --data DIR --out RUN`` trains as the row says, measures, and prints the row
 with the published figure, its source, and the machine; without ROW it lists the rows. ``--part 10`` trains for a tenth
 of the iterations, with the schedule compressed accordingly. DIR is what ``minisplat-ref data SET`` fetches. A run in
-RUN that has ended is not trained again. ``docs/measured/published.md`` has what was found.
+RUN that has ended is not trained again, and one that was stopped continues. ``docs/measured/published.md`` has what was
+found.
 
 Published figures differ in more than the method, so each row says under which rules it was measured. On Lego, the
 images are composited onto white, there are no points, and random ones in a cube are the start
@@ -19,6 +20,8 @@ from typing import NamedTuple
 
 from data_tools.few_images import FIRST, PAPERS, THREE, FewImages, FewPhotographs, thin_out
 from minisplat_ref.app.cli import main as minisplat_ref
+from minisplat_ref.app.runs.run_folder import CONFIG, METRICS, is_finished
+from minisplat_ref.app.runs.settings import load
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import integer
 from minisplat_ref.interface.reporting import describe_machine, markdown_table
@@ -114,7 +117,7 @@ def shortened(options: Sequence[str], part: int) -> list[str]:
 
 
 def measure(name: str, data: Path, out: Path, part: int = 1) -> list[str]:
-    """Train a row, unless that has been done, and return its cells.
+    """Train a row to its end, unless that has been done, and return its cells.
 
     Raises
     ------
@@ -124,9 +127,14 @@ def measure(name: str, data: Path, out: Path, part: int = 1) -> list[str]:
     row = ROWS[name]
     scene = data if row.few is None else thin_out(data, row.few, out.parent / row.few.folder)
     options = shortened(row.options, part)
-    if not (out / "metrics.json").is_file() and minisplat_ref(["train", str(scene), *options, "--out", str(out)]):
+    command = None
+    if not (out / CONFIG).exists():
+        command = ["train", str(scene), *options, "--out", str(out)]
+    elif not is_finished(out, load(out).iterations):  # it was stopped
+        command = ["train", "--resume", str(out)]
+    if command is not None and minisplat_ref(command):
         raise InputError(f"{name}: the training has failed")
-    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
     return cells(name, metrics, row.published if tuple(options) == row.options else None)
 
 

@@ -116,6 +116,10 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     assert re.search(r"\| 1 +\| - ", capsys.readouterr().out)  # what is published is of all iterations
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    config["settings"]["iterations"] = 3  # as if it had been stopped after two of them, which are measured, too
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    assert main(command) == 0 and re.search(r"3dgs-accel \| 3 ", capsys.readouterr().out)
     assert main(["lego-8-3dgs", "--data", str(tmp_path / "no"), "--out", str(tmp_path / "b" / "run")]) == 2
     assert "is missing: give the folder" in capsys.readouterr().err
     assert main([]) == 0 and "fern-adaptive" in capsys.readouterr().out
