@@ -76,8 +76,7 @@ def proceed_when_little_is_gained(
     if slopes is None:
         return None
     n_views = len(iteration.scene.train_views)
-    gain: float | None = None
-    error: float | None = None
+    gain, error = None, None
     if iteration.cooling.holds_out(n_views):
         gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
         if gain >= min_gain:

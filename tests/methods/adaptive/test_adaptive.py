@@ -346,6 +346,17 @@ def test_the_prune_ends_where_it_costs_held_out_views_too_much(cooling, monkeypa
     assert (len(state.gaussians.means) == n) == bool(ends)
 
 
+def test_of_few_views_the_prune_is_measured_on_two_that_are_trained_on(cooling, monkeypatch):
+    """The reason says so, as they are not held out."""
+    state, here = cooling
+    values = of_values([20.0] * 6 + [19.9], [0.5] * 7)
+    state.pace = state.pace._replace(while_cooling=tuple(values[:6]))
+    monkeypatch.setattr(prune, "evaluate_measured", lambda *_, **__: values[6])
+    limits = PRUNING | {"max_psnr_cost": 0.1}
+    prune_in_slices(state, here._replace(step=131, cooling=ADAPTIVE.cooling), **limits)
+    assert "the measured training views might lose 0.20 ± 0.00 dB" in state.pace.decisions[-1].why
+
+
 def test_the_prune_ends_where_no_slice_is_due_anymore(cooling):
     """After 0.64 of 260 iterations, which is 166.4, whether the last slice was one or not."""
     state, here = cooling

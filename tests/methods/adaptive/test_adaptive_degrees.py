@@ -36,7 +36,7 @@ from tolerances import CLOSED_FORM
 
 BACKGROUND = np.array([0.3, 0.3, 0.3])
 N_VIEWS = 24
-SHORT = configure(ADAPTIVE._replace(iterations=600), min_step=10_000, budget=40)
+SHORT = configure(ADAPTIVE._replace(iterations=600), min_step=10_000, budget=40, hold_out_from=0)
 
 
 # Grow -----------------------------------------------------------------------------------------------------------------
