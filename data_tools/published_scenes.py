@@ -2,9 +2,9 @@
 
 ``python -m data_tools.published_scenes ROW --data DIR --out RUN`` trains as the row says, measures, and prints the row
 with the published figure, its source, and the machine; without ROW it lists the rows. ``--part 10`` trains for a tenth
-of the iterations, with the schedule compressed accordingly. DIR is what ``minisplat-ref data SET`` fetches. A run in
-RUN that has ended is not trained again, and one that was stopped continues. ``docs/measured/published.md`` has what was
-found.
+of the iterations, with the schedule compressed accordingly, ``--seed 1`` with another seed, and ``--set NAME=VALUE``
+with another setting of the recipe. DIR is what ``minisplat-ref data SET`` fetches. A run in RUN that has ended is not
+trained again, and one that was stopped continues. ``docs/measured/published.md`` has what was found.
 
 Published figures differ in more than the method, so each row says under which rules it was measured. On Lego, the
 images are composited onto white, there are no points, and random ones in a cube are the start
@@ -116,7 +116,30 @@ def shortened(options: Sequence[str], part: int) -> list[str]:
     ]
 
 
-def measure(name: str, data: Path, out: Path, part: int = 1) -> list[str]:
+class Variant(NamedTuple):
+    """How a training differs from that of its row."""
+
+    part: int = 1
+    """1 / ``part`` of the iterations."""
+    seed: int = 0
+    settings: tuple[str, ...] = ()
+    """Of the recipe, NAME=VALUE."""
+
+    def options(self, row: Row) -> list[str]:
+        """Return the options of ``minisplat-ref train``."""
+        changed = [word for setting in self.settings for word in ("--set", setting)]
+        return [*shortened(row.options, self.part), "--seed", str(self.seed), *changed]
+
+    def name(self, row: str) -> str:
+        """Return the name of the row with the seed, unless it is 0, and the settings."""
+        return ", ".join([row, *([f"seed {self.seed}"] if self.seed else []), *self.settings])
+
+    def published(self, row: Row) -> float | None:
+        """Return what is published for the same iterations and settings; it holds for every seed."""
+        return None if self.settings or shortened(row.options, self.part) != list(row.options) else row.published
+
+
+def measure(name: str, data: Path, out: Path, variant: Variant) -> list[str]:
     """Train a row to its end, unless that has been done, and return its cells.
 
     Raises
@@ -126,16 +149,15 @@ def measure(name: str, data: Path, out: Path, part: int = 1) -> list[str]:
     """
     row = ROWS[name]
     scene = data if row.few is None else thin_out(data, row.few, out.parent / row.few.folder)
-    options = shortened(row.options, part)
     command = None
     if not (out / CONFIG).exists():
-        command = ["train", str(scene), *options, "--out", str(out)]
+        command = ["train", str(scene), *variant.options(row), "--out", str(out)]
     elif not is_finished(out, load(out).iterations):  # it was stopped
         command = ["train", "--resume", str(out)]
     if command is not None and minisplat_ref(command):
         raise InputError(f"{name}: the training has failed")
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
-    return cells(name, metrics, row.published if tuple(options) == row.options else None)
+    return cells(variant.name(name), metrics, variant.published(row))
 
 
 def cells(name: str, metrics: dict[str, float], reference: float | None) -> list[str]:
@@ -158,6 +180,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, metavar="DIR", help="what `minisplat-ref data SET --out DIR` has fetched")
     parser.add_argument("--out", type=Path, metavar="RUN", help="folder of the run, new or with a run that has ended")
     parser.add_argument("--part", type=integer(1), default=1, metavar="N", help="1 / N of the iterations (default all)")
+    parser.add_argument("--seed", type=integer(0), default=0, metavar="N", help="of the training (default 0)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="another setting of the recipe, as in `train`; nothing published is beside it",
+    )
     args = parser.parse_args(arguments)
     if args.row is None:
         for name, row in ROWS.items():
@@ -166,7 +196,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.data is None or args.out is None:
         parser.error(f"{args.row} needs --data DIR and --out RUN")
     try:
-        found = measure(args.row, args.data, args.out, args.part)
+        found = measure(args.row, args.data, args.out, Variant(args.part, args.seed, tuple(args.set)))
     except InputError as error:
         print(f"published_scenes: error: {error}", file=sys.stderr)
         return 2

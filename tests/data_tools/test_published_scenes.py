@@ -8,7 +8,7 @@ import pytest
 
 from data_tools import published_scenes
 from data_tools.few_images import FIRST, PAPERS, THREE, thin_out
-from data_tools.published_scenes import ROWS, cells, main, shortened
+from data_tools.published_scenes import ROWS, Variant, cells, main, shortened
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene, write_image
 
@@ -103,6 +103,16 @@ def test_a_part_of_the_iterations():
     assert "255,255,255" in options and shortened(ROWS["lego-adaptive"].options, 10) == [*ROWS["lego-adaptive"].options]
 
 
+def test_another_seed_is_compared_with_what_is_published_and_another_setting_is_not():
+    row = ROWS["lego-3dgs"]
+    seed, setting = Variant(seed=2), Variant(settings=("budget=9", "min_opacity=0.1"))
+    assert seed.options(row) == [*row.options, "--seed", "2"] and seed.published(row) == 35.78
+    assert setting.options(row)[-4:] == ["--set", "budget=9", "--set", "min_opacity=0.1"]
+    assert setting.published(row) is None and Variant(part=10).published(row) is None
+    assert seed.name("lego-3dgs") == "lego-3dgs, seed 2" and Variant().name("lego-3dgs") == "lego-3dgs"
+    assert setting.name("lego-3dgs") == "lego-3dgs, budget=9, min_opacity=0.1"
+
+
 def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     short = ROWS["lego-first-8-3dgs-accel"]._replace(options=("--recipe", "3dgs-accel", "--iterations", "2"))
     monkeypatch.setitem(published_scenes.ROWS, "lego-first-8-3dgs-accel", short)
@@ -114,6 +124,10 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     assert re.search(r"\| 2 +\| 22\.48 ", printed)
     assert main([*command[:-1], str(tmp_path / "half"), "--part", "2"]) == 0
     assert re.search(r"\| 1 +\| - ", capsys.readouterr().out)  # what is published is of all iterations
+    other = [*command[:-1], str(tmp_path / "other"), "--seed", "3", "--set", "dropout=0.1"]
+    assert main(other) == 0 and "3dgs-accel, seed 3, dropout=0.1 | 2" in capsys.readouterr().out
+    config = json.loads((tmp_path / "other" / "config.json").read_text())["settings"]
+    assert config["seed"] == 3 and config["set"] == {"dropout": "0.1"}
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     config = json.loads((tmp_path / "run" / "config.json").read_text())
