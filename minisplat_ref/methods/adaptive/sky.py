@@ -18,7 +18,7 @@ sky.
 
 Other pixels would drown it, because of all that the scene has not learned yet. A wall that is all of one colour is no
 sky: its photographs disagree about the direction in which its edges lie. All photographs see one sky, so nearly all of
-them gain by it, and a sky explains nearly all of its pixels; so the mean gain has to exceed 2 dB, and three standard
+them gain by it, and a sky explains nearly all of its pixels; so the mean gain has to exceed 3 dB, and three standard
 errors, where a calibration with parameters for each photograph needs one. To compare the sums over all photographs in
 place of the mean of their gains was tried: it finds a sky in a table top, and misses one of six in *outdoor* (N).
 
