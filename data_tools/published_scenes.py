@@ -14,7 +14,8 @@ images are composited onto white, there are no points, and random ones in a cube
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -145,19 +146,41 @@ def measure(name: str, data: Path, out: Path, variant: Variant) -> list[str]:
     Raises
     ------
     InputError
-        The training fails, for a reason that has been printed.
+        ``out`` has a training of something else, or the training fails, for a reason that has been printed.
     """
     row = ROWS[name]
     scene = data if row.few is None else thin_out(data, row.few, out.parent / row.few.folder)
     command = None
     if not (out / CONFIG).exists():
         command = ["train", str(scene), *variant.options(row), "--out", str(out)]
-    elif not is_finished(out, load(out).iterations):  # it was stopped
+    else:
+        _refuse_another(out, variant.options(row))
+    if command is None and not is_finished(out, load(out).iterations):  # it was stopped
         command = ["train", "--resume", str(out)]
     if command is not None and minisplat_ref(command):
         raise InputError(f"{name}: the training has failed")
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
     return cells(variant.name(name), metrics, variant.published(row))
+
+
+def _refuse_another(out: Path, options: Sequence[str]) -> None:
+    """Raise InputError if the run in ``out`` has another recipe, seed, settings or number of iterations."""
+    settings = load(out)
+    given = dict(pairwise(options))
+    changed = [after for before, after in pairwise(options) if before == "--set"]
+    wanted = {
+        "recipe": (settings.recipe, given["--recipe"]),
+        "seed": (settings.seed, int(given["--seed"])),
+        "iterations": (settings.iterations, int(given.get("--iterations", settings.iterations))),
+        "settings": (_words(f"{name}={value}" for name, value in settings.set.items()), _words(changed)),
+    }
+    for name, (found, value) in wanted.items():
+        if found != value:
+            raise InputError(f"{out} was trained with {name} {found}, not {value}: give another --out")
+
+
+def _words(settings: Iterable[str]) -> str:
+    return ", ".join(sorted(settings)) or "of the recipe alone"
 
 
 def cells(name: str, metrics: dict[str, float], reference: float | None) -> list[str]:

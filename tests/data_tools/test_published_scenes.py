@@ -128,9 +128,14 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     assert main(other) == 0 and "3dgs-accel, seed 3, dropout=0.1 | 2" in capsys.readouterr().out
     config = json.loads((tmp_path / "other" / "config.json").read_text())["settings"]
     assert config["seed"] == 3 and config["set"] == {"dropout": "0.1"}
+    assert main(other[:-2]) == 2 and "with settings dropout=0.1, not of the recipe alone" in capsys.readouterr().err
+    assert main([*command, "--seed", "3"]) == 2 and "with seed 0, not 3" in capsys.readouterr().err
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     config = json.loads((tmp_path / "run" / "config.json").read_text())
+    longer = short._replace(options=(*short.options[:-1], "3"))
+    monkeypatch.setitem(published_scenes.ROWS, "lego-first-8-3dgs-accel", longer)
+    assert main(command) == 2 and "was trained with iterations 2, not 3: give another --out" in capsys.readouterr().err
     config["settings"]["iterations"] = 3  # as if it had been stopped after two of them, which are measured, too
     (tmp_path / "run" / "config.json").write_text(json.dumps(config))
     assert main(command) == 0 and re.search(r"3dgs-accel \| 3 ", capsys.readouterr().out)
