@@ -5,8 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
-from minisplat_ref.methods.adaptive.evidence import Evidence
-from minisplat_ref.methods.adaptive.numbers import SKY_GAIN_MIN, SKY_N_ERRORS
+from minisplat_ref.methods.adaptive.numbers import SKY_GAIN_MIN
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.adaptive.sky import (
     HUGE,
@@ -104,14 +103,6 @@ def test_photographs_judge_each_other():
 
 
 # The decision ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_sky_is_told_from_bare_walls():
-    """What was measured of both: at most 2.05 ± 0.43 dB on plain-wall, at least 5.07 ± 1.65 dB on outdoor."""
-    coefficients = np.zeros((16, 3))
-    assert not Evidence(2.05, 0.43, coefficients).is_above(SKY_GAIN_MIN, SKY_N_ERRORS)
-    assert Evidence(5.07, 1.65, coefficients).is_above(SKY_GAIN_MIN, SKY_N_ERRORS)
-    assert not Evidence(5.07, 1.75, coefficients).is_above(SKY_GAIN_MIN, SKY_N_ERRORS)
 
 
 def test_veils_before_a_sky_are_replaced_by_it(truth, sky):
