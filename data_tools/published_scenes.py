@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 from data_tools.few_images import FIRST, PAPERS, THREE, FewImages, FewPhotographs, thin_out
 from minisplat_ref.app.cli import main as minisplat_ref
+from minisplat_ref.app.runs.options import Settings
 from minisplat_ref.app.runs.run_folder import CONFIG, METRICS, is_finished
 from minisplat_ref.app.runs.settings import load
 from minisplat_ref.errors import InputError
@@ -150,25 +151,24 @@ def measure(name: str, data: Path, out: Path, variant: Variant) -> list[str]:
     """
     row = ROWS[name]
     scene = data if row.few is None else thin_out(data, row.few, out.parent / row.few.folder)
-    command = None
-    if not (out / CONFIG).exists():
-        command = ["train", str(scene), *variant.options(row), "--out", str(out)]
-    else:
-        _refuse_another(out, variant.options(row))
-    if command is None and not is_finished(out, load(out).iterations):  # it was stopped
-        command = ["train", "--resume", str(out)]
+    options = variant.options(row)
+    command: list[str] | None = ["train", str(scene), *options, "--out", str(out)]
+    if (out / CONFIG).exists():
+        settings = load(out)
+        _refuse_another(out, settings, scene, options)
+        command = None if is_finished(out, settings.iterations) else ["train", "--resume", str(out)]
     if command is not None and minisplat_ref(command):
         raise InputError(f"{name}: the training has failed")
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
     return cells(variant.name(name), metrics, variant.published(row))
 
 
-def _refuse_another(out: Path, options: Sequence[str]) -> None:
-    """Raise InputError if the run in ``out`` has another recipe, seed, settings or number of iterations."""
-    settings = load(out)
+def _refuse_another(out: Path, settings: Settings, scene: Path, options: Sequence[str]) -> None:
+    """Raise InputError if the run in ``out`` has another scene, recipe, seed, settings or number of iterations."""
     given = dict(pairwise(options))
     changed = [after for before, after in pairwise(options) if before == "--set"]
     wanted = {
+        "scene": (settings.scene, str(scene.resolve())),
         "recipe": (settings.recipe, given["--recipe"]),
         "seed": (settings.seed, int(given["--seed"])),
         "iterations": (settings.iterations, int(given.get("--iterations", settings.iterations))),

@@ -130,6 +130,8 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     assert config["seed"] == 3 and config["set"] == {"dropout": "0.1"}
     assert main(other[:-2]) == 2 and "with settings dropout=0.1, not of the recipe alone" in capsys.readouterr().err
     assert main([*command, "--seed", "3"]) == 2 and "with seed 0, not 3" in capsys.readouterr().err
+    monkeypatch.setitem(published_scenes.ROWS, "lego-8-3dgs-accel", short._replace(few=PAPERS))
+    assert main(["lego-8-3dgs-accel", *command[1:]]) == 2 and "was trained with scene " in capsys.readouterr().err
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     config = json.loads((tmp_path / "run" / "config.json").read_text())

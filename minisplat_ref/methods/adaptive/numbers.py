@@ -90,8 +90,8 @@ RIDGE = 1e-3
 # --- a sky ---
 
 SKY_GAIN_MIN = 3.0
-"""dB of the squared error, where a sky shows: it explains nearly all that is there. Skies explain 5 dB and more, bare
-walls up to 2.05 (H)."""
+"""dB of the squared error, where a sky shows: it explains nearly all that is there. The skies of *outdoor* and
+*glossy* explain 5 dB and more, bare walls up to 2.05; most that are planted in *glossy* explain less, too (H)."""
 SKY_N_ERRORS = 3.0
 """Standard errors that the gain of a sky must exceed: nearly all photographs gain by it, because they see one sky."""
 LARGE, HUGE = 0.25, 1.0

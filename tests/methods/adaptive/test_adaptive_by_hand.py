@@ -115,7 +115,7 @@ def test_a_sky_is_drawn_towards_zero_by_a_thousandth():
         ("sky", 3.6, 1.21, False),
         ("sky", 3.6, 1.19, True),
         ("sky", 2.05, 0.43, False),  # the most that was measured of bare walls
-        ("sky", 5.07, 1.65, True),  # the least of a sky
+        ("sky", 5.07, 1.65, True),  # the least of the sky of outdoor
         *(
             (name, *case)
             for name in ("antialiasing", "pose")
