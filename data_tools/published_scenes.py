@@ -150,15 +150,18 @@ def measure(name: str, data: Path, out: Path, variant: Variant) -> list[str]:
         ``out`` has a training of something else, or the training fails, for a reason that has been printed.
     """
     row = ROWS[name]
-    scene = data if row.few is None else thin_out(data, row.few, out.parent / row.few.folder)
+    scene = data if row.few is None else out.parent / row.few.folder
     options = variant.options(row)
     command: list[str] | None = ["train", str(scene), *options, "--out", str(out)]
     if (out / CONFIG).exists():
         settings = load(out)
         _refuse_another(out, settings, scene, options)
         command = None if is_finished(out, settings.iterations) else ["train", "--resume", str(out)]
-    if command is not None and minisplat_ref(command):
-        raise InputError(f"{name}: the training has failed")
+    if command is not None:
+        if row.few is not None:
+            thin_out(data, row.few, scene)
+        if minisplat_ref(command):
+            raise InputError(f"{name}: the training has failed")
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
     return cells(variant.name(name), metrics, variant.published(row))
 

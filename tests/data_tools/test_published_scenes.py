@@ -132,6 +132,7 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     assert main([*command, "--seed", "3"]) == 2 and "with seed 0, not 3" in capsys.readouterr().err
     monkeypatch.setitem(published_scenes.ROWS, "lego-8-3dgs-accel", short._replace(few=PAPERS))
     assert main(["lego-8-3dgs-accel", *command[1:]]) == 2 and "was trained with scene " in capsys.readouterr().err
+    assert not (tmp_path / "lego-8").exists()  # nothing is copied for a row that is refused
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     config = json.loads((tmp_path / "run" / "config.json").read_text())
