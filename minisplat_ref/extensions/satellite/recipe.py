@@ -161,7 +161,7 @@ def begin_transparent(state: TrainState, iteration: Iteration, *, opacity: float
 
     Points that fill a volume are a fog if they are as opaque as those on a surface (0.1), and a fog explains a few
     photographs as well as a surface does. Of nearly transparent ones some grow, and the others are pruned. As long as
-    nearly nothing is opaque, altitudes count as the lowest and nothing shades: this helps a ground that lies there.
+    nearly nothing is opaque, altitudes count as the lowest and nothing shades, which favours a ground that lies there.
     """
     g = state.gaussians
     lower_opacities(state, np.full_like(g.opacity_logits, np.log(opacity / (1 - opacity))))
