@@ -5,11 +5,13 @@ The claim is ours, and the way every relative's own should be read: a relative o
 (:mod:`.kit.alike`). Where its release changes some of these, too, it has a second row, *as released*, with what differs
 besides. Arms that would differ in more than the mechanism are refused.
 
-With ``--after RECIPE`` every arm continues from the model that this recipe trains with the same seed, as TextureSplat
-does after Ref-Gaussian; then its base is itself without the mechanism, ``texture-splat+texels=1``.
+With ``--after RECIPE`` every arm continues from the one model that this recipe trains with the same seed, as
+TextureSplat does after Ref-Gaussian; then its base is itself without the mechanism, ``texture-splat+texels=1``.
 """
 
 import argparse
+import copy
+import functools
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -102,9 +104,18 @@ def run(args: argparse.Namespace) -> kit.Report:
     settings = {"scene": scene.name, "downscale": args.downscale}
     settings |= kit.settings_of(args, "iterations", "base", "after", "settings")
     jobs = kit.jobs_of(arm=arms, seed=args.seeds)
-    records = kit.resume(
-        args.out, settings, jobs, lambda arm, seed: outcome(scene, arms[arm].recipe, before, seed), lambda _: None
-    )
+
+    @functools.cache
+    def begun(seed: int) -> Model:
+        assert before is not None
+        return train(scene, before, seed=seed).model
+
+    def measure(arm: str, seed: int) -> dict[str, Any]:
+        recipe = arms[arm].recipe
+        state = None if before is None else continued(begun(seed), before, scene, recipe, seed)
+        return outcome(scene, recipe, state, seed)
+
+    records = kit.resume(args.out, settings, jobs, measure)
     rows = [{**record, "unlike": ", ".join(arms[record["arm"]].unlike) or "-"} for record in records]
     title = f"{scene.name}, {args.iterations:,} iterations{after(args)}, {kit.seeds_of(args)}; {describe_machine()}"
     text = f"{title}\n\n{table(rows, {'arm': 'arm'}, COLUMNS)}\n\n{describe_differences(rows, list(arms))}"
@@ -119,11 +130,8 @@ def after(args: argparse.Namespace) -> str:
     return "".join([*parts, *(f", {setting}" for setting in args.settings)])
 
 
-def outcome(scene: Scene, recipe: Recipe, before: Recipe | None, seed: int) -> dict[str, Any]:
-    """Train an arm, and return the measures of its test views; the seconds are those of the arm alone."""
-    state = None
-    if before is not None:
-        state = continued(train(scene, before, seed=seed).model, before, scene, recipe, seed)
+def outcome(scene: Scene, recipe: Recipe, state: TrainState | None, seed: int) -> dict[str, Any]:
+    """Train an arm, from a state or from the scene's points, and return the measures of its test views."""
     start = time.process_time()
     model = train(scene, recipe, seed=seed, state=state).model
     seconds = time.process_time() - start
@@ -142,12 +150,15 @@ def outcome(scene: Scene, recipe: Recipe, before: Recipe | None, seed: int) -> d
 def continued(model: Model, before: Recipe, scene: Scene, recipe: Recipe, seed: int) -> TrainState:
     """Return the state before the first iteration of a recipe that continues a model, as ``train --init RUN`` does.
 
+    The model stays as it is for other arms, although a training updates its arrays in place.
+
     Raises
     ------
     InputError
         The recipe does not train such a model.
     """
     rng = np.random.default_rng(seed)
+    model = copy.deepcopy(model)
     population = convert_population(model.gaussians, before.representation, recipe.representation, rng)
     if population is None:
         raise InputError(f"recipe {recipe.name} does not train what {before.name} does: give another --after")

@@ -156,8 +156,16 @@ def test_from_the_command_line(room, tmp_path, capsys):
     assert measure_claim(command) == 2
 
 
-def test_arms_that_continue(room, tmp_path):
-    """Both continue from the same model, whose number stays, and the base is the relative with one texel."""
+def test_arms_that_continue(room, tmp_path, monkeypatch):
+    """Both continue from one model, whose number stays, and the base is the relative with one texel."""
+    starts = []
+
+    def train(scene, recipe, *, seed, state=None):
+        starts.append(None if state is None else state.gaussians.means.copy())
+        return trained(scene, recipe, seed=seed, state=state)
+
+    trained = relatives.train
+    monkeypatch.setattr(relatives, "train", train)
     command = ["relatives", room, "--base", "texture-splat+texels=1", "--relatives", "texture-splat+texels=2"]
     command += ["--after", "reflective", "--iterations", "8", "--seeds", "0", "--out", str(tmp_path / "out")]
     assert measure_claim(command) == 0
@@ -165,3 +173,5 @@ def test_arms_that_continue(room, tmp_path):
     assert (base["arm"], relative["arm"]) == ("texture-splat+texels=1", "texture-splat+texels=2")
     assert base["n_primitives"] == relative["n_primitives"] and base["floats"] < relative["floats"]
     assert np.isfinite([base["psnr"], relative["psnr"]]).all()
+    assert starts[0] is None and len(starts) == 3  # the model is trained once, and no arm changes it
+    assert np.array_equal(starts[1], starts[2])
