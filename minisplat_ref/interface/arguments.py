@@ -149,6 +149,12 @@ def color(text: str) -> list[float]:
     return [value / 255.0 for value in values]
 
 
+def add_background(parser: argparse._ActionsContainer) -> None:
+    """Add ``--background``, None where it is not given: that of the run."""
+    text = "0 to 255 each (default: the run's, or 0,0,0)"
+    parser.add_argument("--background", type=color, metavar="R,G,B", help=text)
+
+
 def option_name(name: str) -> str:
     """Return the name of a setting on the command line."""
     return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"

@@ -136,6 +136,9 @@ def test_a_row_from_the_command_line(lego, tmp_path, monkeypatch, capsys):
     log = (tmp_path / "run" / "log.jsonl").read_bytes()
     assert main(command) == 0 and (tmp_path / "run" / "log.jsonl").read_bytes() == log  # not trained again
     config = json.loads((tmp_path / "run" / "config.json").read_text())
+    smaller = short._replace(options=(*short.options, "--downscale", "4"))
+    monkeypatch.setitem(published_scenes.ROWS, "lego-first-8-3dgs-accel", smaller)
+    assert main(command) == 2 and "with downscale 1, not 4" in capsys.readouterr().err
     longer = short._replace(options=(*short.options[:-1], "3"))
     monkeypatch.setitem(published_scenes.ROWS, "lego-first-8-3dgs-accel", longer)
     assert main(command) == 2 and "was trained with iterations 2, not 3: give another --out" in capsys.readouterr().err

@@ -399,6 +399,20 @@ def test_a_scene_is_refitted_drawn_and_exported(scene_folder, tmp_path, capsys):
     assert main(["info", str(fans)]) == 0 and main(["info", str(tmp_path / "mesh.ply")]) == 2  # which is for others
 
 
+def test_fans_are_trained_and_measured_before_the_background_of_their_run(scene_folder, tmp_path, capsys):
+    run, out = tmp_path / "white", tmp_path / "fans.ply"
+    options = ["--recipe", "3dgs-accel", "--background", "255,255,255", "--test-every", "4", "--iterations", "5"]
+    assert main(["train", str(scene_folder), *options, "--out", str(run)]) == 0
+    printed, bytes_of = {}, {}
+    for name, background in (("its own", []), ("white", ["255,255,255"]), ("black", ["0,0,0"])):
+        given = ["--background", *background] if background else []
+        capsys.readouterr()
+        assert main(["fans", "fine-tune", str(scene_folder), str(run), str(out), "--iterations", "2", *given]) == 0
+        printed[name], bytes_of[name] = capsys.readouterr().out, out.read_bytes()
+    assert printed["its own"] == printed["white"] and printed["black"].split(",")[1] != printed["white"].split(",")[1]
+    assert bytes_of["its own"] == bytes_of["white"] != bytes_of["black"]
+
+
 def test_the_recipe_trains_from_points_resumes_and_is_measured(scene_folder, tmp_path, capsys):
     run = tmp_path / "run"
     options = ["--recipe", "fans", "--test-every", "4", "--set", "n_sides=6", "--set", "max_layers=8"]
@@ -444,6 +458,8 @@ def test_models_that_hold_nothing_are_refused(model, scene_folder, tmp_path, cap
             assert "none.ply holds no" in line and not out.exists()
     tune = ["fans", "fine-tune", str(scene_folder), str(model)]
     assert main([*tune, str(tmp_path / "out.glb")]) == 2 and "fans export" in capsys.readouterr().err
+    white = ["fans", "fine-tune", "room", str(model), str(out), "--background", "255,255,255"]
+    assert main(white) == 2 and "room is made on black" in capsys.readouterr().err and not out.exists()
     with pytest.raises(SystemExit, match="2"):
         main([*tune, str(out), "--iterations", "0"])
     assert "--iterations" in capsys.readouterr().err

@@ -30,6 +30,7 @@ from minisplat_ref.extensions.rays.lights import (
 )
 from minisplat_ref.extensions.rays.model import TRACED, intersect, whiten_model
 from minisplat_ref.extensions.rays.render import check_lights
+from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, save_mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
@@ -263,6 +264,17 @@ def test_draws_a_scene_with_all_there_is(ply, tmp_path, capsys):
         assert main(["rays", "render", str(ply), *options]) == 0
         images.add((out / "front.png").read_bytes())
     assert len(images) == 4 and "1 images in" in capsys.readouterr().out
+
+
+def test_the_background_is_given_as_for_other_commands(ply, tmp_path):
+    camera = {"position": [0, 0, -90], "rotation": np.eye(3).tolist(), "width": 8, "height": 6, "fx": 8, "fy": 8}
+    (tmp_path / "cameras.json").write_text(json.dumps([{**camera, "img_name": "far"}]))
+    options = ["--scene", str(described(tmp_path)), "--cameras", str(tmp_path / "cameras.json")]
+    shown = {}
+    for name, given in (("none", []), ("given", ["--background", "255,128,0"])):
+        assert main(["rays", "render", str(ply), *options, *given, "--out", str(tmp_path / name)]) == 0
+        shown[name] = read_image(tmp_path / name / "far.png")[0, 0].tolist()
+    assert shown == {"none": [0, 0, 0], "given": [255, 128, 0]}
 
 
 @pytest.mark.parametrize(

@@ -233,6 +233,16 @@ def test_the_recipe_trains_and_evaluates(scene_folder, tmp_path):
     assert main(["eval", str(run)]) == 0
 
 
+def test_textures_are_trained_before_the_background(scene_folder, run_folder, tmp_path, capsys):
+    before = {}
+    for name, given in (("its own", []), ("black", ["--background", "0,0,0"]), ("red", ["--background", "255,0,0"])):
+        command = ["textured", "fine-tune", str(scene_folder), str(run_folder / "point_cloud.ply"), "--iterations", "1"]
+        capsys.readouterr()
+        assert main([*command, *given, "--out", str(tmp_path / "t.ply")]) == 0
+        before[name] = capsys.readouterr().out.partition("test PSNR ")[2].partition(",")[0]
+    assert before["its own"] == before["black"] != before["red"]
+
+
 @pytest.mark.parametrize("option", ["--degree=4", "--iterations=0", "--downscale=0"])
 def test_bad_input_is_one_line(scene_folder, run_folder, tmp_path, capsys, option):
     out = tmp_path / "t.ply"

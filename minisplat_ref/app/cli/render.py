@@ -12,10 +12,10 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.interface.arguments import (
     Commands,
     HelpFormatter,
+    add_background,
     add_renderer_arguments,
     add_up_argument,
     add_worker_arguments,
-    color,
     drop_workers,
     integer,
     positive,
@@ -91,9 +91,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help=argparse.SUPPRESS)
     add_worker_arguments(parser, "in N processes at once; --cluster ADDRESS: elsewhere", argparse.SUPPRESS)
     parser.add_argument("--part", type=_part, help=argparse.SUPPRESS)  # A:B of the images, which a worker is told
-    parser.add_argument(
-        "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
-    )
+    add_background(parser)
     add_up_argument(parser)
     add_renderer_arguments(parser)
     parser.set_defaults(run=run)

@@ -7,9 +7,9 @@ from minisplat_ref.interface.arguments import (
     VIEWER_PORT,
     Commands,
     HelpFormatter,
+    add_background,
     add_renderer_arguments,
     add_up_argument,
-    color,
     integer,
 )
 
@@ -52,9 +52,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--environment", type=Path, metavar="FILE", help="other light by latitude and longitude: image or .npy"
     )
-    parser.add_argument(
-        "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
-    )
+    add_background(parser)
     add_up_argument(parser)
     add_renderer_arguments(parser)
     parser.set_defaults(run=run)

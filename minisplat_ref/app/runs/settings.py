@@ -29,9 +29,9 @@ from minisplat_ref.io.frames import (
     return_population,
 )
 from minisplat_ref.io.images import check_downscale
-from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.io.run_files import background_in
 from minisplat_ref.io.scene import Listing, build_reading, build_scene
 from minisplat_ref.io.upright import FILE, Up, find_up, read_up, up_from_json, up_to_json
 from minisplat_ref.mechanisms.cameras.models import check_optics
@@ -223,10 +223,7 @@ def load_background(folder: Path) -> Floats:
     InputError
         As for :func:`load`.
     """
-    background = as_array(_read_config(folder).get("background"), (3,))
-    if background is None or not ((background >= 0) & (background <= 1)).all():
-        raise InputError(f"{folder / CONFIG} has no background of three numbers from 0 to 1")
-    return background
+    return background_in(_read_config(folder), folder / CONFIG)
 
 
 def load_frame(folder: Path) -> Frame:

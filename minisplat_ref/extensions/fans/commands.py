@@ -18,10 +18,10 @@ from minisplat_ref.extensions.fans.model import (
     mesh_of,
     visible_mesh,
 )
-from minisplat_ref.interface.arguments import add_number
+from minisplat_ref.interface.arguments import add_background, add_number
 from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.ply import load_ply
-from minisplat_ref.io.run_files import model_file
+from minisplat_ref.io.run_files import model_file, read_background
 from minisplat_ref.mechanisms.meshes.files import check_suffix
 from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import RenderSettings
@@ -82,6 +82,7 @@ def add_parser(commands: Any) -> None:
     add_number(tune, "--downscale", 1, "make photographs D times smaller", metavar="D")
     add_number(tune, "--iterations", 1000, "length")
     add_number(tune, "--seed", 0, "of the training", minimum=0, metavar="S")
+    add_background(tune)
     _add_shape(tune)
     tune.set_defaults(run=run_fine_tune)
 
@@ -183,7 +184,8 @@ def run_fine_tune(args: argparse.Namespace) -> int:
     if not args.out.parent.is_dir():
         raise InputError(f"{args.out.parent} is no folder: make it, or give another OUT")
     start = load_as_fans(args.model, read_shape(args))
-    scene = read_scene(args.scene, args.downscale)
+    background = read_background(model_file(args.model), args.background)
+    scene = read_scene(args.scene, args.downscale, background=background)
     before = measure(start, scene, scene.test_views)
     with progress_bar("vertices", "iterations", args.iterations) as bar:
         fans = fine_tune(start, scene, args.iterations, args.seed, lambda _: bar.update())

@@ -26,6 +26,7 @@ from minisplat_ref.extensions.rays.lights import (
     shade,
 )
 from minisplat_ref.extensions.rays.model import Whitened, make_tracer, whiten_model
+from minisplat_ref.interface.arguments import add_background
 from minisplat_ref.interface.progress import with_progress
 from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
@@ -33,7 +34,7 @@ from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.label import warn_of_another
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.ply import load_ply, read_label
-from minisplat_ref.io.run_files import CAMERAS, model_file
+from minisplat_ref.io.run_files import CAMERAS, model_file, read_background
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, load_mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.rendering.backends import CPU
@@ -171,9 +172,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the images")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: the run's test views)")
     parser.add_argument("--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)")
-    parser.add_argument(
-        "--background", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help="0 to 1 each"
-    )
+    add_background(parser)
     parser.set_defaults(run=run)
 
 
@@ -187,11 +186,9 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.frames < 1:
         raise InputError(f"--frames is {args.frames}: give at least 1")
-    background = np.array(args.background)
-    if not ((background >= 0) & (background <= 1)).all():
-        raise InputError(f"--background is {' '.join(f'{x:g}' for x in background)}: give three numbers from 0 to 1")
     around = read_surroundings(args.scene)
     file = model_file(args.model)
+    background = read_background(file, args.background)
     gaussians = load_ply(file)
     warn_of_another(file, read_label(file), "rays", "rays render")
     whitened = whiten_model(Model(gaussians))

@@ -6,10 +6,11 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.textured.model import DEGREE
-from minisplat_ref.interface.arguments import add_number
+from minisplat_ref.interface.arguments import add_background, add_number
 from minisplat_ref.interface.progress import progress_bar
 from minisplat_ref.io.label import Label
 from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.io.run_files import read_background
 
 
 def add_parser(commands: Any) -> None:
@@ -32,6 +33,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--frozen", action="store_true", help="train no positions and shapes, as the paper's text says")
     add_number(parser, "--seed", 0, "of the training", minimum=0, metavar="S")
+    add_background(parser)
     parser.set_defaults(run=run)
 
 
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     gaussians = load_ply(args.ply)
     if len(gaussians.means) == 0:
         raise InputError(f"{args.ply} holds no Gaussians: give the PLY of a run")
-    scene = read_scene(args.scene, args.downscale)
+    scene = read_scene(args.scene, args.downscale, background=read_background(args.ply, args.background))
     before = measure(gaussians, scene, scene.test_views)
     with progress_bar("textures", "iterations", args.iterations) as bar:
         start = prepare(gaussians, args.degree, args.replace)
