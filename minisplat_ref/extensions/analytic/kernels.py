@@ -47,17 +47,17 @@ def pixel_response(exp: Callable) -> KernelResponse:
         # I is even in u; with u <= 0 both tails are small, so no two numbers near one are subtracted.
         u_1 = records[n, COS] * dx + records[n, SIN] * dy
         u_2 = records[n, COS] * dy - records[n, SIN] * dx
-        I_1, _, _ = integral(-abs(u_1), records[n, RATE_1])
-        I_2, _, _ = integral(-abs(u_2), records[n, RATE_2])
-        return records[n, OPACITY] * records[n, MASS] * I_1 * I_2, records[n, DEPTH], (u_1, u_2, I_1, I_2)
+        I_1, by_u_1, by_r_1 = integral(-abs(u_1), records[n, RATE_1])
+        I_2, by_u_2, by_r_2 = integral(-abs(u_2), records[n, RATE_2])
+        place = u_1, u_2, I_1, I_2, by_u_1, by_u_2, by_r_1, by_r_2
+        return records[n, OPACITY] * records[n, MASS] * I_1 * I_2, records[n, DEPTH], place
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
         """With ``M = 2 pi o / (r_1 r_2)``: v_I_1 = v M I_2, v_r_k -= v alpha / r_k, v_angle = v_u_1 u_2 - v_u_2 u_1."""
-        u_1, u_2, I_1, I_2 = place
+        u_1, u_2, I_1, I_2, by_u_1, by_u_2, by_r_1, by_r_2 = place
         mass, cos, sin = records[n, MASS], records[n, COS], records[n, SIN]
-        _, by_u_1, by_r_1 = integral(u_1, records[n, RATE_1])
-        _, by_u_2, by_r_2 = integral(u_2, records[n, RATE_2])
+        by_u_1, by_u_2 = select(u_1 > ZERO, -by_u_1, by_u_1), select(u_2 > ZERO, -by_u_2, by_u_2)  # odd in u
         M = records[n, OPACITY] * mass
         a_1, a_2, alpha = M * I_2 * by_u_1, M * I_1 * by_u_2, M * I_1 * I_2  # dalpha / du_k
         return (
