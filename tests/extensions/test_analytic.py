@@ -11,9 +11,10 @@ from data_tools.claims import analytic as footprint
 from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.app.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.extensions.analytic.boxes import visible_boxes
 from minisplat_ref.extensions.analytic.model import INTEGRATED, stages
 from minisplat_ref.extensions.analytic.response import (
     EXACT_RESPONSE,
@@ -212,6 +213,42 @@ def test_a_pixel_holds_the_integral_of_what_is_thinner_than_it(backend):
     assert_allclose(alpha[15:17, 31:33], quarter, rtol=1e-6)  # the constants of F are rounded to float32
     alpha[15:17, 31:33] = 0
     assert_array_equal(alpha, 0)
+
+
+@pytest.mark.parametrize("alpha_min", [1 / 255, 0.05, 0.0])
+def test_a_box_has_every_pixel_in_which_a_gaussian_is_seen(alpha_min, rng):
+    """Needles and balls from 0.01 to 30 pixels at any angle, of any opacity, around 24 x 24 pixels."""
+    n, size = 3000, 24
+    angles, sigmas = rng.uniform(0, np.pi, n), np.exp(rng.uniform(np.log(0.01), np.log(30), (n, 2)))
+    sigmas[::3, 1] = sigmas[::3, 0]
+    axes = np.stack([np.cos(angles), np.sin(angles), -np.sin(angles), np.cos(angles)], 1).reshape(n, 2, 2)
+    Q = np.einsum("nki,nk,nkj->nij", axes, sigmas**-2.0, axes)
+    boxes = np.tile(np.array([[0, 0, size, size]], np.int32), (n, 1))
+    means, opacities = rng.uniform(-8, size + 8, (n, 2)), rng.uniform(0, 1, n)
+    projection = Projection(means, np.ones(n), Q[:, [0, 0, 1], [0, 1, 1]], opacities, np.ones((n, 2), np.int32), boxes)
+    centers = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2) + 0.5
+    alphas = RESPONSE.hit(projection, np.arange(n), centers).unclamped.reshape(n, size, size)
+    x0, y0, x1, y1 = visible_boxes(projection, alpha_min).T[:, :, None, None]
+    y, x = np.mgrid[:size, :size]
+    is_inside = (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+    assert not (alphas[~is_inside] >= alpha_min).any()
+    is_seen = (alphas >= alpha_min).any((1, 2))
+    assert is_seen.sum() > n / 3
+    if (
+        alpha_min > 0
+    ):  # and few others: 4 / pi times the pixels of a circle, more around needles
+        assert is_inside.sum() < 2 * (alphas >= alpha_min).sum() < is_inside.size
+    else:
+        assert is_inside.all()
+
+
+def test_in_the_conventions_of_inria_kernels_and_reference_agree(rng):
+    """There a Gaussian is drawn in all tiles that its largest extent touches, beyond its box of pixels."""
+    gaussians, view = make_gaussians(rng, 60, size=0.15), view_from(make_camera(70, 40, rng=rng))
+    request = Request(conventions=INRIA)
+    images = [DRAW.render(Model(gaussians), view, request._replace(backend=b))[0].image for b in (CPU, REFERENCE)]
+    assert np.abs(images[1]).max() > COVERAGE_MIN
+    assert_allclose(images[0], images[1], atol=PARITY_FLOAT64)
 
 
 def test_wide_gaussians_are_drawn_as_by_3dgs_without_a_low_pass(backend, rng):

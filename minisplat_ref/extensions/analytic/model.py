@@ -9,6 +9,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
+from minisplat_ref.extensions.analytic.boxes import visible_boxes
 from minisplat_ref.extensions.analytic.kernels import response_for
 from minisplat_ref.extensions.analytic.response import RESPONSE
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -24,14 +25,15 @@ from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import CompositeGradient, Floats, Model, Projection, RenderOutput, TileBins, TileGrid, View
 
 
-def with_pixel_integrals(backend: Backend) -> Backend:
+def with_pixel_integrals(backend: Backend, alpha_min: float) -> Backend:
     """Return the backend with integrals over pixels instead of samples at their centres.
 
-    Lists of tiles are the reference's, because those of the kernels omit footprints that reach no pixel's centre.
+    Kernels look only where a Gaussian may have an alpha of ``alpha_min``. Lists of tiles are the reference's, because
+    those of the kernels omit footprints that reach no pixel's centre.
     """
 
     def choose(by_kernels: Callable[..., Any], by_reference: Callable[..., Any]) -> Callable[..., Any]:
-        return _choose_response(by_kernels) if backend.is_compiled else partial(by_reference, RESPONSE)
+        return _choose_response(by_kernels, alpha_min) if backend.is_compiled else partial(by_reference, RESPONSE)
 
     hits_vjp = choose(kernel_hits.composite_hits_vjp, composite_hits_vjp)
 
@@ -59,17 +61,20 @@ def with_pixel_integrals(backend: Backend) -> Backend:
     )
 
 
-def _choose_response(function: Callable[..., Any]) -> Callable[..., Any]:
+def _choose_response(function: Callable[..., Any], alpha_min: float) -> Callable[..., Any]:
     """Return a function of projection, colours and more, which takes the kernels' response in their dtype."""
-    return lambda projection, colors, *others, **wanted: function(
-        response_for(colors.dtype), projection, colors, *others, **wanted
-    )
+
+    def call(projection: Projection, colors: Floats, *others: Any, **wanted: Any) -> Any:
+        seen = projection._replace(boxes=visible_boxes(projection, alpha_min))
+        return function(response_for(colors.dtype), seen, colors, *others, **wanted)
+
+    return call
 
 
 def render_integrals(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
     """Render the view as 3DGS does, but with integrals and without a low-pass; the tape keeps the backend."""
     conventions = request.conventions._replace(eps2d=0.0, is_antialiased=False)
-    backend = with_pixel_integrals(request.backend)
+    backend = with_pixel_integrals(request.backend, conventions.alpha_min)
     return SPLATTING.render(model, view, request._replace(backend=backend, conventions=conventions))
 
 
