@@ -84,7 +84,7 @@ FIGURES = {
 }
 """Published PSNR, dB, and its source, by recipe."""
 QUARTER = ("3dgs-accel", "antialiasing", "analytic", "rays", "polygons")
-"""Recipes that are trained at 200 x 200, too: an iteration of the last three takes seconds at 800 x 800."""
+"""Recipes that are trained at 200 x 200, too: an iteration of ``rays`` takes seconds at 800 x 800."""
 MORE = {"mcmc": ("--budget", "325000")}
 """Options by recipe."""
 

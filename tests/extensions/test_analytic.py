@@ -234,9 +234,7 @@ def test_a_box_has_every_pixel_in_which_a_gaussian_is_seen(alpha_min, rng):
     assert not (alphas[~is_inside] >= alpha_min).any()
     is_seen = (alphas >= alpha_min).any((1, 2))
     assert is_seen.sum() > n / 3
-    if (
-        alpha_min > 0
-    ):  # and few others: 4 / pi times the pixels of a circle, more around needles
+    if alpha_min > 0:  # and few others: 4 / pi times the pixels of a circle, more around needles
         assert is_inside.sum() < 2 * (alphas >= alpha_min).sum() < is_inside.size
     else:
         assert is_inside.all()
