@@ -8,10 +8,16 @@ from data_tools.foreign_files.gltf import glb_parts, only_primitive, values
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.srgb import encode_srgb
 from minisplat_ref.mechanisms.fusion import kernels, reference, volume
-from minisplat_ref.mechanisms.fusion.extraction import ColoredMesh, extract, keep_largest
+from minisplat_ref.mechanisms.fusion.extraction import (
+    ColoredMesh,
+    extract,
+    keep_largest,
+    marching_cubes_package,
+    without_flat,
+)
 from minisplat_ref.mechanisms.fusion.volume import Contraction, DepthMap, Grid, Volume, empty_volume
 from minisplat_ref.mechanisms.meshes.files import check_suffix, to_glb, write_mesh
-from minisplat_ref.mechanisms.meshes.mesh import load_mesh
+from minisplat_ref.mechanisms.meshes.mesh import check_mesh, flat_triangles, load_mesh
 from minisplat_ref.types import Camera
 from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32
 
@@ -167,6 +173,32 @@ def test_a_closed_body_is_watertight():
     p0, p1, p2 = np.moveaxis(mesh.corners, 1, 0)
     inside = np.sum(np.cross(p0, p1) * p2) / 6
     assert inside == pytest.approx(4 / 3 * np.pi * (1 + swollen.mean() * 0.065) ** 3, rel=0.01)
+
+
+def test_where_the_surface_runs_through_voxels_no_triangle_is_flat_and_no_hole_is_left():
+    """An octahedron whose faces go through centres of voxels, where marching cubes put several corners in one place."""
+    grid = Grid((-10.0,) * 3, 1.0, (21, 21, 21))
+    empty = empty_volume(grid)
+    distances = (np.abs(grid.places()).sum(axis=-1) - 6).astype(empty.distances.dtype) / 6
+    seen = empty._replace(distances=distances, weights=np.full_like(empty.weights, 2))
+    raw, _, _, _ = marching_cubes_package().marching_cubes(seen.distances, 0.0)
+    assert len(np.unique(raw, axis=0)) < len(raw)
+    mesh = extract(seen, grid, 2)
+    check_mesh(mesh, "octahedron")
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
+    p0, p1, p2 = np.moveaxis(mesh.corners, 1, 0)
+    assert np.sum(np.cross(p0, p1) * p2) / 6 == pytest.approx(4 / 3 * 6**3, rel=ROUNDED_TO_FLOAT32)
+
+
+def test_flat_triangles_by_hand():
+    """Corners 1 and 2 are one place, so triangle 0 vanishes and 1 has corner 1; the corners of 2 lie on one line."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1e-9, 0], [1, 1, 0], [2, 0, 0], [4, 0, 0]], np.float64)
+    mesh = ColoredMesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5]]), np.zeros((6, 3)))
+    assert flat_triangles(mesh.corners).tolist() == [True, False, True]
+    assert without_flat(mesh).faces.tolist() == [[0, 1, 3]]
+    none = mesh._replace(faces=np.zeros((0, 3), np.int64))
+    assert without_flat(none).faces.shape == (0, 3)
 
 
 def test_contracted_space_by_hand():

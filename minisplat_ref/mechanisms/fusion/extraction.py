@@ -9,7 +9,10 @@ from scipy.sparse.csgraph import connected_components
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.mechanisms.fusion.volume import Grid, Volume
+from minisplat_ref.mechanisms.meshes.mesh import flat_triangles, side_lengths
 from minisplat_ref.types import Bools, Floats, Ints
+
+SHORT_SIDE = 1e-3  # of a flat triangle's longest side; the ends of a shorter one become one vertex
 
 
 class ColoredMesh(NamedTuple):
@@ -66,7 +69,7 @@ def extract(volume: Volume, grid: Grid, min_views: int) -> ColoredMesh:
         ) from None
     colors = [map_coordinates(volume.colors[..., c], places.T, order=1, mode="nearest") for c in range(3)]
     vertices = grid.to_world(np.array(grid.origin) + grid.voxel * places.astype(np.float64))
-    return ColoredMesh(vertices, faces.astype(np.int64), np.clip(np.stack(colors, axis=1), 0, 1))
+    return without_flat(ColoredMesh(vertices, faces.astype(np.int64), np.clip(np.stack(colors, axis=1), 0, 1)))
 
 
 def _whole_cells(is_seen: Bools) -> Bools:
@@ -74,6 +77,26 @@ def _whole_cells(is_seen: Bools) -> Bools:
     for axis in range(3):
         is_seen = np.logical_and(np.delete(is_seen, -1, axis), np.delete(is_seen, 0, axis))
     return is_seen
+
+
+def without_flat(mesh: ColoredMesh) -> ColoredMesh:
+    """Return a mesh without the triangles that have no area, as others refuse them.
+
+    They occur where the surface runs through the centre of a voxel: marching cubes then put corners of several cells in
+    one place. Such corners become one, which leaves no hole; a flat triangle without a short side is left out.
+    """
+    is_flat = flat_triangles(mesh.corners)
+    if not is_flat.any():
+        return mesh
+    n, flat = len(mesh.vertices), mesh.faces[is_flat]
+    sides = side_lengths(mesh.corners[is_flat])  # [F, 3]
+    is_short = sides <= SHORT_SIDE * sides.max(axis=1, keepdims=True)
+    ends = flat[is_short], np.roll(flat, -1, axis=1)[is_short]
+    _, place = connected_components(coo_array((np.ones(len(ends[0]), bool), ends), shape=(n, n)), directed=False)
+    _, first = np.unique(place, return_index=True)  # the vertex that stands for all in its place
+    faces = first[place[mesh.faces]]
+    is_kept = ~flat_triangles(mesh.vertices[faces])
+    return mesh._replace(faces=faces[is_kept])
 
 
 def keep_largest(mesh: ColoredMesh, n_parts: int) -> ColoredMesh:

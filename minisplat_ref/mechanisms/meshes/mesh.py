@@ -20,7 +20,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.ply import MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import Bools, Floats, Ints
 
 HEIGHT_MIN = 1e-6  # of a triangle over its longest side; below, its frame loses more than half of float64's digits
 
@@ -117,16 +117,24 @@ def check_mesh(mesh: Mesh, source: str | Path) -> None:
             f"{source}: face {face} has the corner {mesh.faces[face, corner]}, but there are {len(mesh.vertices)}"
             " vertices, counted from 0; export the mesh again"
         )
-    corners = mesh.corners
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)  # [T, 3]
-    longest = sides.max(axis=1)  # [T]
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)  # 2 area
-    is_flat = ~(doubled > HEIGHT_MIN * longest**2)
+    is_flat = flat_triangles(mesh.corners)
     if is_flat.any():
         raise InputError(
             f"{source}: triangle {np.argmax(is_flat)} has no area ({is_flat.sum()} of {len(is_flat)} have none): its"
             " corners coincide or lie on one line; merge vertices that coincide, or remove those faces"
         )
+
+
+def flat_triangles(corners: Floats) -> Bools:
+    """Return which triangles [T], of ``corners`` [T, 3, 3], have no area: their corners coincide or lie on one line."""
+    longest = side_lengths(corners).max(axis=1, initial=0)  # [T]
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)  # 2 area
+    return np.asarray(~(doubled > HEIGHT_MIN * longest**2))
+
+
+def side_lengths(corners: Floats) -> Floats:
+    """Return the lengths [T, 3] of the sides of triangles: of side k from corner k to the next."""
+    return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
 
 
 def check_same_faces(rest: Mesh, deformed: Mesh, source: str | Path) -> None:
