@@ -54,7 +54,7 @@ def read_background(file: Path, given: Sequence[float] | None = None) -> Floats:
         return np.array(given, np.float64)
     if not beside.is_file():
         return np.zeros(3)
-    return background_in(read_json(beside, "give --background R,G,B and a copy of the PLY elsewhere"), beside)
+    return background_in(read_json(beside, "give --background R,G,B"), beside)
 
 
 def background_in(config: Any, path: Path) -> Floats:
