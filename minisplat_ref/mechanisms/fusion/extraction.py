@@ -12,7 +12,7 @@ from minisplat_ref.mechanisms.fusion.volume import Grid, Volume
 from minisplat_ref.mechanisms.meshes.mesh import flat_triangles, side_lengths
 from minisplat_ref.types import Bools, Floats, Ints
 
-SHORT_SIDE = 1e-3  # of a flat triangle's longest side; the ends of a shorter one become one vertex
+SHORT_SIDE = 1e-3  # of a flat triangle's longest side, our choice; the ends of a shorter one become one vertex
 
 
 class ColoredMesh(NamedTuple):
