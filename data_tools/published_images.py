@@ -1,24 +1,25 @@
 """Lego image by image: PSNR of the test images of runs, beside that of a rerun of the released 3DGS by others.
 
-``python -m data_tools.published_images RUN [RUN ...]`` reads the metrics of runs that have ended. A mean can agree by
-chance; two renderers that agree image by image find the same images hard.
+``python -m data_tools.published_images RUN [RUN ...]`` reads the metrics of runs that have ended, or what
+``minisplat-ref eval RUN --out DIR`` has written of one that was stopped. A mean can agree by chance; two renderers that
+agree image by image find the same images hard.
 
 ``published_lego.csv`` has the PSNR of 157 of the 200 test images, from the raw metrics in
 ``gaussian-splatting/blender/lego.json`` of jkulhanek/nerfbaselines on Hugging Face, at f84852e, read in a copy that
-breaks off there. The 200 numbers stand in the order of the file names, r_0, r_1, r_10, r_100, and so on: in the order
-of the cameras, which go around the model, they are a smooth curve. Their mean, of all 200, is 35.70 dB.
+breaks off after them. It does not name the images. Read in the order of the file names, r_0, r_1, r_10, r_100, and so
+on, its numbers are a smooth curve over the cameras, which go around the model, except at r_125, where those of our runs
+are not smooth either. The mean of all 200 is 35.70 dB there.
 """
 
 import argparse
 import csv
-import json
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.app.runs.run_folder import METRICS
+from minisplat_ref.app.runs.run_folder import METRICS, read_json_object
 from minisplat_ref.errors import InputError
 from minisplat_ref.interface.reporting import markdown_table
 
@@ -56,11 +57,11 @@ def compare(folder: Path) -> Agreement:
     Raises
     ------
     InputError
-        The run has not ended, or fewer than three of its test images are published.
+        There are no metrics, or fewer than three of the test images are published.
     """
     if not (folder / METRICS).is_file():
         raise InputError(f"{folder} has no {METRICS}: give the --out folder of a training that has ended")
-    metrics = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+    metrics = read_json_object(folder / METRICS)
     ours = {view["name"].removeprefix("test_"): view["psnr"] for view in metrics["per_view"]}
     published = read_published()
     names = [name for name in published if name in ours]
